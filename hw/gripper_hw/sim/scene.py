@@ -27,6 +27,7 @@ _PAD_HALF_THICKNESS_M = 0.004
 _OPEN_SPARE_M = {"rack": 0.004, "other": 0.001}
 """Travel of a jaw beyond the open position. Other linkages than a rack are near their dead centre there."""
 _ROD_RADIUS_M = 0.012
+_RAIL_ABOVE_GRIP_M = 0.085
 _FINGER_X_M = {"pads": 0.009, "discs": 0.009, "rods": 0.022}
 """Distance of the finger behind the centre of a pad, by tool."""
 
@@ -245,9 +246,8 @@ def _of_rig(drawn: Scene, config: SimConfig) -> Scene:
 
 
 def _draw_jaws(rig: Scene, seed: int, spread: float) -> Scene:
-    depth, height, finger, pad_gray, finger_gray = spread * np.random.default_rng([seed, 20]).uniform(
-        -1, 1, 5
-    )
+    rng = np.random.default_rng([seed, 20])
+    depth, height, finger, pad_gray, finger_gray = spread * rng.uniform(-1, 1, 5)
     return replace(
         rig,
         pad_half_m=(
@@ -299,23 +299,38 @@ def scene_mjcf(
         )
     file = Path(scene.object_file) if scene.object_file else None
     model = build_object(scene.object, scene.detail, scene.size, scene.stiffness, file)  # type: ignore[arg-type]
-    grip = np.array([0.0, 0.0, model.grip_height_m])
-    position = grip + scene.camera_from_grip_m + scene.camera_offset_m
-    target = grip + scene.camera_aim_m + scene.camera_target_offset_m
-    template = Template(
-        resources.files(__package__).joinpath("assets/gripper.xml").read_text(encoding="utf-8")
-    )
+    text = _filled_template(scene, gripper, model, second)
+    if model.spec is not None:
+        from gripper_hw.sim.object_files import attach
+
+        text = attach(text, model, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG))
+    if not textured:
+        return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG) | model.files
+    from gripper_hw.sim.textures import draw_markers, draw_textures
+
+    pattern = None if model.texture in model.files else model.texture
+    images = draw_textures(pattern, scene.texture_seed, scene.table_seed)
+    return text, images | (draw_markers() if scene.markers else {}) | model.files
+
+
+def _filled_template(scene: Scene, gripper: GripperConfig, model: ObjectModel, second: Scene | None) -> str:
+    """Returns the MJCF text of a scene; an object that has a file of its own MJCF is not yet in it."""
+    grip_m = np.array([0.0, 0.0, model.grip_height_m])
+    camera_m = grip_m + scene.camera_from_grip_m + scene.camera_offset_m
+    aim_m = grip_m + scene.camera_aim_m + scene.camera_target_offset_m
+    rail_height_m = model.grip_height_m + _RAIL_ABOVE_GRIP_M
+    template = Template(resources.files(__package__).joinpath("assets/gripper.xml").read_text("utf-8"))
     radius_m, rails = gripper.pinion_radius_m, 2 if second is None else 1
-    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails)
-    text = template.substitute(
+    inertia_kg_m2, damping_nm_s, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails)
+    return template.substitute(
         object=escape(scene.object, {'"': "&quot;"}),
         timestep_s=model.timestep_s,
         object_material=_material(model),
         light_direction=numbers(scene.light_direction),
         light_diffuse=numbers([1.0 - scene.light_ambient] * 3),
         light_ambient=numbers([scene.light_ambient] * 3),
-        camera_position=numbers(position),
-        camera_axes=numbers(_camera_axes(position, target, scene.camera_roll_deg)),
+        camera_position=numbers(camera_m),
+        camera_axes=numbers(_camera_axes(camera_m, aim_m, scene.camera_roll_deg)),
         camera_fovy=scene.camera_fovy_deg,
         object_position=numbers([*scene.offset_m, 0.0]),
         object_yaw=scene.yaw_deg,
@@ -337,46 +352,34 @@ def scene_mjcf(
         marker_materials=_MARKER_MATERIALS if scene.markers else "",
         finger_x=_FINGER_X_M[scene.tool],
         grip_height=numbers([model.grip_height_m]),
-        rail_height=numbers([model.grip_height_m + 0.085]),
-        rotor_inertia=inertia,
-        servo_damping=damping,
+        rail_height=numbers([rail_height_m]),
+        rotor_inertia=inertia_kg_m2,
+        servo_damping=damping_nm_s,
         friction_nm=friction_nm + rail_friction_nm,
         hard_friction=_HARD_FRICTION,
         backlash_m=scene.backlash_m,
         pinion_radius_m=radius_m,
-        coupling=_COUPLING if second is None else "",
-        second_horn="" if second is None else _second_horn(second, radius_m, model.grip_height_m + 0.085),
-        second_rack="" if second is None else _second_rack(second, radius_m),
-        second_motor="" if second is None else '<motor name="second_servo" joint="second_servo"/>',
-    )
-    if model.spec is not None:
-        from gripper_hw.sim.object_files import attach
-
-        text = attach(text, model, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG))
-    if not textured:
-        return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG) | model.files
-    from gripper_hw.sim.textures import draw_markers, draw_textures
-
-    pattern = None if model.texture in model.files else model.texture
-    images = draw_textures(pattern, scene.texture_seed, scene.table_seed)
-    return text, images | (draw_markers() if scene.markers else {}) | model.files
-
-
-def _second_horn(scene: Scene, radius_m: float, height_m: float) -> str:
-    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails=1)
-    return (
-        f'<body name="second_horn" pos="-.03 0 {numbers([height_m])}"><joint name="second_servo" type="hinge" '
-        f'axis="0 -1 0" armature="{inertia}" damping="{damping}" frictionloss="{friction_nm + rail_friction_nm}" '
-        f'{_HARD_FRICTION}/><geom type="cylinder" size=".012 .006" euler="90 0 0" material="steel" contype="0" '
-        'conaffinity="0" mass=".005"/></body>'
+        **_finger_coupling(second, radius_m, rail_height_m),
     )
 
 
-def _second_rack(scene: Scene, radius_m: float) -> str:
-    return (
-        f'<fixed name="second_rack" range="-{scene.backlash_m} {scene.backlash_m}" solreflimit=".004 1">'
+def _finger_coupling(second: Scene | None, radius_m: float, rail_height_m: float) -> dict[str, str]:
+    """Returns the parts of the template that couple the fingers, or drive the second one by a servo of its own."""
+    if second is None:
+        return {"coupling": _COUPLING, **dict.fromkeys(("second_horn", "second_rack", "second_motor"), "")}
+    inertia_kg_m2, damping_nm_s, friction_nm, rail_friction_nm = horn_dynamics(second, radius_m, rails=1)
+    horn = (
+        f'<body name="second_horn" pos="-.03 0 {numbers([rail_height_m])}"><joint name="second_servo" type="hinge" '
+        f'axis="0 -1 0" armature="{inertia_kg_m2}" damping="{damping_nm_s}" '
+        f'frictionloss="{friction_nm + rail_friction_nm}" {_HARD_FRICTION}/><geom type="cylinder" '
+        'size=".012 .006" euler="90 0 0" material="steel" contype="0" conaffinity="0" mass=".005"/></body>'
+    )
+    rack = (
+        f'<fixed name="second_rack" range="-{second.backlash_m} {second.backlash_m}" solreflimit=".004 1">'
         f'<joint joint="left" coef="1"/><joint joint="second_servo" coef="-{radius_m}"/></fixed>'
     )
+    motor = '<motor name="second_servo" joint="second_servo"/>'
+    return {"coupling": "", "second_horn": horn, "second_rack": rack, "second_motor": motor}
 
 
 def _tool(scene: Scene, side: int) -> str:
@@ -407,12 +410,11 @@ def _background(scene: Scene) -> str:
     """Boxes and ellipsoids, from dark to bright; `World` moves them."""
     if not scene.moving_background:
         return ""
+    sizes_m = np.random.default_rng(scene.table_seed).uniform(0.008, 0.025, (BACKGROUND_OBJECTS, 3))
     return "".join(
-        f'<geom name="background_{i}" type="{"ellipsoid" if i % 2 else "box"}" size="{numbers(size)}" '
+        f'<geom name="background_{i}" type="{"ellipsoid" if i % 2 else "box"}" size="{numbers(size_m)}" '
         f'rgba="{numbers([*(3 * [(i + 1) / BACKGROUND_OBJECTS]), 1])}" contype="0" conaffinity="0"/>'
-        for i, size in enumerate(
-            np.random.default_rng(scene.table_seed).uniform(0.008, 0.025, (BACKGROUND_OBJECTS, 3))
-        )
+        for i, size_m in enumerate(sizes_m)
     )
 
 
