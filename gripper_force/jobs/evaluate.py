@@ -142,41 +142,34 @@ def evaluate(
         from gripper_force.jobs.report.plots import check_figure_path
 
         check_figure_path(plot)
-    settings = (Config() if config is None else config).with_values(vision={"checkpoint": str(checkpoint)})
-    if profile is not None:
-        settings = settings.with_values(calibration={"object": profile})
-    if settings.calibration.object not in (None, "own"):
-        settings, _ = with_bundle(settings)
+    settings = _settings(config, checkpoint, profile)
     model = read_model(settings.vision.checkpoint)
     paths = find_logs(logs)
-    one = partial(
+    evaluate_log = partial(
         _evaluate_log,
         checkpoint=(model.path, model.digest),
         config=settings.model_dump(mode="json"),
         objects=(objects,) if isinstance(objects, str) else tuple(objects),
         include_contact_starts=include_contact_starts,
     )
-    found, failed = Workers(workers, ray).read_logs(one, paths, "evaluated", progress)
+    found, failed = Workers(workers, ray).read_logs(evaluate_log, paths, "evaluated", progress)
     chosen = {paths[number]: log for number, log in found.items() if log is not None}
     if not chosen:
-        others = [paths[number] for number in found]
-        there = sorted({config_from_text(LogReader(path).config, str(path)).object for path in others})
-        raise DataError(f"no log is of {', '.join(objects)}; there are {', '.join(there)}")
-    used = {path: one for path, one in chosen.items() if one.forces_n is not None}
+        raise _no_such_object(objects, [paths[number] for number in found])
+    used = [(path, log.clip, log.forces_n) for path, log in chosen.items() if log.forces_n is not None]
     if not used:
-        without_contact_starts([one.clip for one in chosen.values()], model.header.preprocess)  # raises
-    clips = [one.clip for one in used.values()]
-    forces_n = [one.forces_n for one in used.values() if one.forces_n is not None]
-    each = list(zip(used, clips, forces_n, strict=True))
+        without_contact_starts([log.clip for log in chosen.values()], model.header.preprocess)  # raises
+    clips = [clip for _, clip, _ in used]
+    forces_n = [estimates_n for _, _, estimates_n in used]
     lead_in = model.header.preprocess.lead_in
     result = replace(
         errors_on(clips, forces_n, lead_in),
         left_out=len(chosen) - len(clips),
-        per_log={str(path): _log_errors(clip, force_n, lead_in) for path, clip, force_n in each},
+        per_log={str(path): _log_errors(clip, estimates_n, lead_in) for path, clip, estimates_n in used},
         failed={str(paths[number]): str(error) for number, error in failed.items()},
     )
     if out is not None:
-        columns = [_columns(*one) for one in each]
+        columns = [_columns(*log) for log in used]
         write_summary(out, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
     if plot is not None:
         from gripper_force.jobs.report.plots import draw_estimates
@@ -184,6 +177,21 @@ def evaluate(
         title = f"{checkpoint}: MAE {result.mae_n:.3f} N on {len(clips)} logs"
         draw_estimates(*_labelled(clips, forces_n, lead_in), title, plot)
     return result
+
+
+def _settings(config: Config | None, checkpoint: str | Path, profile: str | None) -> Config:
+    """Returns the configuration with checkpoint and profile; a profile's bundle brings its own checkpoint."""
+    settings = (Config() if config is None else config).with_values(vision={"checkpoint": str(checkpoint)})
+    if profile is not None:
+        settings = settings.with_values(calibration={"object": profile})
+    if settings.calibration.object not in (None, "own"):
+        settings, _ = with_bundle(settings)
+    return settings
+
+
+def _no_such_object(objects: Collection[str], paths: Sequence[Path]) -> DataError:
+    there = sorted({config_from_text(LogReader(path).config, str(path)).object for path in paths})
+    return DataError(f"no log is of {', '.join(objects)}; there are {', '.join(there)}")
 
 
 def _columns(path: Path, clip: Clip, forces_n: npt.NDArray[np.floating]) -> dict[str, npt.NDArray[Any]]:

@@ -93,25 +93,7 @@ def trials(
                 "grasps of the same object follow one another; pass one --object, and no --jobs but 1"
             )
         config = with_same_object(config)
-    min_n, max_n = TRIAL_TARGETS_N
-    largest_n = {}
-    for name in objects:
-        resolved = resolve(config.with_values(object=name))  # measures what `auto` needs once, here
-        resolved.check_target(min_n if target_n is None else target_n)
-        largest_n[name] = min(max_n, resolved.largest_target_n)
-    rng = np.random.default_rng([config.seed, 20])
-    plan = []
-    for i in range(count):
-        name = objects[i % len(objects)]
-        drawn_n = min(round(float(rng.uniform(min_n, largest_n[name])), 3), largest_n[name])
-        plan.append(
-            config.with_values(
-                object=name,
-                target_n=drawn_n if target_n is None else target_n,
-                seed=config.seed + i,
-                log={"report": False},  # `replay LOG --report` draws any of them later
-            )
-        )
+    plan = _planned(config, count, objects, target_n)
     if workers > 1:
         with process_pool(workers) as pool:
             yield from pool.map(_trial, [trial.model_dump(mode="json") for trial in plan])
@@ -132,6 +114,30 @@ def trials(
                 f"trial {number} of {count} ended with a fault, so no further one was run; look at the gripper, "
                 f"and at the fault with: gripper-force replay {result['log']} --report"
             )
+
+
+def _planned(config: Config, count: int, objects: Sequence[str], target_n: float | None) -> list[Config]:
+    """Returns the configuration of each trial: its object, target and seed."""
+    min_n, max_n = TRIAL_TARGETS_N
+    largest_n = {}
+    for name in objects:
+        resolved = resolve(config.with_values(object=name))  # measures what `auto` needs once, here
+        resolved.check_target(min_n if target_n is None else target_n)
+        largest_n[name] = min(max_n, resolved.largest_target_n)
+    rng = np.random.default_rng([config.seed, 20])
+    plan = []
+    for i in range(count):
+        name = objects[i % len(objects)]
+        drawn_n = min(round(float(rng.uniform(min_n, largest_n[name])), 3), largest_n[name])
+        plan.append(
+            config.with_values(
+                object=name,
+                target_n=drawn_n if target_n is None else target_n,
+                seed=config.seed + i,
+                log={"report": False},  # `replay LOG --report` draws any of them later
+            )
+        )
+    return plan
 
 
 def _trial(tree: Tree) -> GraspSummary:

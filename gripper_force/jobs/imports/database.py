@@ -139,14 +139,7 @@ def import_environment(
     object_name, degrees, illumination = _environment(folder)
     forces_n, problems = read_table(folder / "test.txt")
     images = {int(path.stem): path for path in folder.glob("*.jpg") if _IMAGE.fullmatch(path.stem)}
-    if not images.keys() & forces_n.keys():
-        raise DataError(
-            f"{folder} holds no image that its test.txt names, such as {min(forces_n)}.jpg; download it again"
-        )
-    problems += _problem("{} forces have no image", sorted(forces_n.keys() - images.keys()))
-    others = [p.name for p in folder.iterdir() if p.name != "test.txt" and p not in images.values()]
-    problems += _problem("{} files are neither N.jpg nor test.txt and were left out", sorted(others))
-    problems += _problem("{} images have no force", sorted(images.keys() - forces_n.keys()))
+    problems += _unmatched(folder, images, forces_n)
     sets = find_sets(np.array(list(forces_n)), np.array(list(forces_n.values())))
     metadata = {
         "object": object_name,
@@ -169,16 +162,12 @@ def import_environment(
             kept += 1
             continue
         t_ns = {int(n): round(int(n - part[0]) * NS_PER_S / rate_hz) for n in part}
-        frames: list[Frame] = []
-        for number in sorted(t_ns.keys() & images.keys()):
-            if (gray := _read_image(images[number])) is None:
-                damaged.append(images[number].name)
-            else:
-                frames.append(Frame(t_ns[number], t_ns[number], number, downscale(gray, region, size)))
-        labelled = [n for n in t_ns if n in forces_n]
+        frames, not_decoded = _read_frames(images, t_ns, region, size)
+        damaged += not_decoded
         if not forces_n.keys() & {frame.seq for frame in frames}:
             empty.append(log.stem)
             continue
+        labelled = [n for n in t_ns if n in forces_n]
         samples = load_cell_samples([t_ns[n] for n in labelled], np.array([forces_n[n] for n in labelled]))
         own = {"set": log.stem, "split": split_of(i), "touches": str(touches)}
         rejected, in_contact = write_recording(log, config, {**metadata, **own}, frames, samples)
@@ -203,6 +192,34 @@ def import_environment(
             *_problem("{} sets start in contact, and train and evaluate leave them out", loaded),
         ),
     )
+
+
+def _unmatched(folder: Path, images: dict[int, Path], forces_n: dict[int, float]) -> list[str]:
+    """Returns a sentence for each kind of image, force or file without a counterpart; raises if all are."""
+    if not images.keys() & forces_n.keys():
+        raise DataError(
+            f"{folder} holds no image that its test.txt names, such as {min(forces_n)}.jpg; download it again"
+        )
+    others = [p.name for p in folder.iterdir() if p.name != "test.txt" and p not in images.values()]
+    return [
+        *_problem("{} forces have no image", sorted(forces_n.keys() - images.keys())),
+        *_problem("{} files are neither N.jpg nor test.txt and were left out", sorted(others)),
+        *_problem("{} images have no force", sorted(images.keys() - forces_n.keys())),
+    ]
+
+
+def _read_frames(
+    images: dict[int, Path], t_ns: dict[int, int], region: Region | None, size: int
+) -> tuple[list[Frame], list[str]]:
+    """Returns the frames of the numbers in ``t_ns``, and the names of images that can't be decoded."""
+    frames: list[Frame] = []
+    damaged: list[str] = []
+    for number in sorted(t_ns.keys() & images.keys()):
+        if (gray := _read_image(images[number])) is None:
+            damaged.append(images[number].name)
+        else:
+            frames.append(Frame(t_ns[number], t_ns[number], number, downscale(gray, region, size)))
+    return frames, damaged
 
 
 def read_table(path: Path) -> tuple[dict[int, float], list[str]]:
