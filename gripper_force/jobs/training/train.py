@@ -102,6 +102,33 @@ def train(
                 _fit(config, clips, out, validation_clips, progress)
             process.wait()
             return load_checkpoint(out)
+    config = _checked_recipe(config, init, teacher)
+    training, held_out = clips, validation_clips
+    if held_out is None:
+        training, held_out = _split(config, clips)
+    check_size([*training, *held_out, *replay_clips], config.preprocess)
+    states = state_paths(config, out)
+    with join_training_processes(config.device) as process:
+        trainers = _trained(
+            config, training, states, init, teacher, replay_clips, resume, process, progress, warn
+        )
+        if process.first:
+            networks = [trainer.network for trainer in trainers]
+            forces_n, measured_n = labelled_estimates(held_out, networks, config.preprocess, process.device)
+            labels_n = _labels_n(training)
+            data = [*clips, *replay_clips]
+            _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
+            _add_ood(out, networks, held_out, process.device, warn)
+            if figure:
+                _draw(out, trainers, config, held_out, forces_n, measured_n, float(labels_n.std()))
+            for state in states:
+                state.unlink()
+        process.wait()
+        return load_checkpoint(out)
+
+
+def _checked_recipe(config: TrainConfig, init: Checkpoint | None, teacher: Checkpoint | None) -> TrainConfig:
+    """Returns the recipe with what it takes over from ``init``, after a check that ``teacher`` sees the same images."""
     if init is not None:
         config = continued(config, init.header)
     elif config.freeze_statistics:
@@ -113,29 +140,13 @@ def train(
             f"the teacher sees frames prepared with {teacher.header.preprocess}, and this network with "
             f"{config.preprocess}; set the same preprocess keys"
         )
-    training, held_out = clips, validation_clips
-    if held_out is None:
-        repeated = len({clip.object for clip in clips}) < len({(clip.object, clip.set) for clip in clips})
-        training, held_out = split_by(clips, "set" if repeated else "object", config.validation, config.seed)
-    check_size([*training, *held_out, *replay_clips], config.preprocess)
-    states = state_paths(config, out)
-    with join_training_processes(config.device) as process:
-        trainers = _trained(
-            config, training, states, init, teacher, replay_clips, resume, process, progress, warn
-        )
-        if process.first:
-            networks = [trainer.network for trainer in trainers]
-            forces_n, measured_n = labelled_estimates(held_out, networks, config.preprocess, process.device)
-            labels_n = np.concatenate([clip.forces_n[clip.valid] for clip in training])
-            data = [*clips, *replay_clips]
-            _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
-            _add_ood(out, networks, held_out, process.device, warn)
-            if figure:
-                _draw(out, trainers, config, held_out, forces_n, measured_n, float(labels_n.std()))
-            for state in states:
-                state.unlink()
-        process.wait()
-        return load_checkpoint(out)
+    return config
+
+
+def _split(config: TrainConfig, clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
+    """Splits clips into training and validation: by set, or by object if no object has two sets."""
+    repeated = len({clip.object for clip in clips}) < len({(clip.object, clip.set) for clip in clips})
+    return split_by(clips, "set" if repeated else "object", config.validation, config.seed)
 
 
 def _draw(
@@ -185,17 +196,19 @@ def _fit(
 ) -> None:
     """Fits a Gaussian process and writes its checkpoint. Its stated error is that on objects left out."""
     check_size([*clips, *(validation_clips or [])], config.preprocess)
-    process, _, left_out_n = few.fit(clips, config.preprocess, progress)
-    measured, mean_n = validation_clips, float(np.concatenate([c.forces_n[c.valid] for c in clips]).mean())
-    if measured is None:
-        measured = clips
-    else:
-        left_out_n = [predict([process], config.preprocess, clip.frames)[0] for clip in measured]
-    forces_n, measured_n = (
-        np.concatenate([part[clip.valid] for part, clip in zip(parts, measured, strict=True)])
-        for parts in (left_out_n, [clip.forces_n for clip in measured])
+    process, _, estimates_n = few.fit(clips, config.preprocess, progress)
+    held_out = clips
+    if validation_clips is not None:
+        held_out = validation_clips
+        estimates_n = [predict([process], config.preprocess, clip.frames)[0] for clip in held_out]
+    forces_n = np.concatenate(
+        [clip_n[clip.valid] for clip_n, clip in zip(estimates_n, held_out, strict=True)]
     )
-    _save(out, [process], config, clips, forces_n, measured_n, mean_n)
+    _save(out, [process], config, clips, forces_n, _labels_n(held_out), float(_labels_n(clips).mean()))
+
+
+def _labels_n(clips: Sequence[Clip]) -> npt.NDArray[np.float32]:
+    return np.concatenate([clip.forces_n[clip.valid] for clip in clips])
 
 
 def _save(
@@ -248,17 +261,7 @@ def _trained(
     progress: Progress,
     warn: Callable[[str], None],
 ) -> list[Trainer]:
-    old = config.replayed if replay_clips else 0
-    if any(0 < part < process.world_size for part in (config.clips - old, old)):
-        raise ConfigError(
-            f"{process.world_size} processes can't share {config.clips} clips per step; increase clips"
-        )
-    if process.world_size > 1 and config.compile:
-        raise ConfigError("compile does not work with several processes; set compile=false")
-    new = Batches(clips, config, process)
-    batches = (
-        Replay(new, Batches(replay_clips, config, process), config.replay_share) if replay_clips else new
-    )
+    batches = _batches(config, clips, replay_clips, process)
     start = " ".join(checkpoint.digest if checkpoint is not None else "" for checkpoint in (init, teacher))
     data = digest([*clips, *replay_clips])
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data} {start}"
@@ -276,6 +279,23 @@ def _trained(
         _run(trainer, config.attentions[member], state, identity, process, progress)
     _warn_of_a_short_training(config, trainers, int(batches.unseen.sum()), len(clips), warn)
     return trainers
+
+
+def _batches(
+    config: TrainConfig, clips: Sequence[Clip], replay_clips: Sequence[Clip], process: TrainingProcess
+) -> Batches | Replay:
+    """Returns what draws the clips of a step, after a check that the processes can share them."""
+    replayed = config.replayed if replay_clips else 0
+    if any(0 < part < process.world_size for part in (config.clips - replayed, replayed)):
+        raise ConfigError(
+            f"{process.world_size} processes can't share {config.clips} clips per step; increase clips"
+        )
+    if process.world_size > 1 and config.compile:
+        raise ConfigError("compile does not work with several processes; set compile=false")
+    batches = Batches(clips, config, process)
+    if not replay_clips:
+        return batches
+    return Replay(batches, Batches(replay_clips, config, process), config.replay_share)
 
 
 def _run(
