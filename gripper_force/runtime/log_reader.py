@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema, Statistics
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import breakup_chunk
 
@@ -143,29 +143,30 @@ class LogReader:
     def _messages(self, wanted: frozenset[type[Record]]) -> Iterator[tuple[Codec, McapMessage]]:
         schemas: dict[int, Schema] = {}
         codecs: dict[int, Codec | None] = {}
+        for item in self._chunk_contents():
+            if isinstance(item, McapMessage):
+                if item.channel_id not in codecs:
+                    raise ValueError("a message before its channel")
+                if (codec := codecs[item.channel_id]) is not None:
+                    yield codec, item
+            elif isinstance(item, Schema):
+                schemas[item.id] = item
+            elif isinstance(item, Channel):
+                codec = self._codec(item, schemas.get(item.schema_id))
+                codecs[item.id] = codec if codec.record_type in wanted else None
+
+    def _chunk_contents(self) -> Iterator[McapRecord]:
+        """Yields schemas, channels and messages of each chunk; with ``recover`` a damaged chunk is left out."""
         with self.path.open("rb") as file:
             for chunk in self._each_chunk():
                 file.seek(chunk.offset)
                 try:
                     whole = _checked(Chunk.read(_stream(file.read(chunk.length))))
-                    items = breakup_chunk(whole, validate_crc=True)
+                    yield from breakup_chunk(whole, validate_crc=True)
                 except _DAMAGE:
                     if not self._recover:
                         raise
                     self.damaged.add(chunk.offset)
-                    continue
-                for item in items:
-                    if isinstance(item, McapMessage):
-                        if item.channel_id not in codecs:
-                            raise ValueError("a message before its channel")
-                        codec = codecs[item.channel_id]
-                        if codec is not None:
-                            yield codec, item
-                    elif isinstance(item, Schema):
-                        schemas[item.id] = item
-                    elif isinstance(item, Channel):
-                        codec = self._codec(item, schemas.get(item.schema_id))
-                        codecs[item.id] = codec if codec.record_type in wanted else None
 
     def _each_chunk(self) -> Iterator[_Chunk]:
         """Yields the chunks to read; a log that is being written has more later (`GrowingLog`)."""
