@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -32,6 +32,9 @@ from gripper_force.cli.output.bench import (
 )
 from gripper_force.cli.viewing import ViewCommand
 from gripper_force.errors import ConfigError
+
+if TYPE_CHECKING:
+    from gripper_force.config import Config
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed, memory and error on this machine.")
 
@@ -68,7 +71,6 @@ def estimator(
     from tempfile import TemporaryDirectory
 
     from gripper_force.jobs.dataset import load_clips
-    from gripper_force.jobs.simulate import plan, simulate
     from gripper_force.qualification.bench import estimator_bench
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.vision.header import SHIPPED
@@ -87,12 +89,7 @@ def estimator(
         read_model(source)  # a wrong name ends the command before its simulation
     with TemporaryDirectory() as name:
         if data is None or scale_on is None:
-            data, scale_on = Path(name) / "data", Path(name) / "scale"
-            made = ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000)))
-            with console.bar("simulating", sum(len(plans) for _, plans in made)) as progress:
-                for logs, plans in made:
-                    for path in simulate(plans, logs, settings, jobs):
-                        progress(path.name)
+            data, scale_on = _simulate_presses(Path(name), settings, jobs)
         with console.bar_or_lines("measuring", estimator_bench.count_steps(sources, counts)) as measured:
             rows = estimator_bench.bench(
                 sources,
@@ -110,6 +107,19 @@ def estimator(
     ratios = estimator_bench.ratios(rows)
     result = {"estimator": rows, "ratios": ratios, "plot": plot, "file": file}
     _show(result, as_json, lambda: estimator_table(rows, ratios, plot, file))
+
+
+def _simulate_presses(folder: Path, settings: "Config", workers: int) -> tuple[Path, Path]:
+    """Simulates the logs to measure the error on, and those to calibrate int8 on. Returns their folders."""
+    from gripper_force.jobs.simulate import plan, simulate
+
+    data, scale_on = folder / "data", folder / "scale"
+    made = ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000)))
+    with console.bar("simulating", sum(len(plans) for _, plans in made)) as progress:
+        for logs, plans in made:
+            for path in simulate(plans, logs, settings, workers):
+                progress(path.name)
+    return data, scale_on
 
 
 @app.command("gain")

@@ -2,7 +2,7 @@
 
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -36,6 +36,7 @@ from gripper_force.plugins import require
 if TYPE_CHECKING:
     from gripper_force.config import Config
     from gripper_force.jobs.checks import RegisterChange
+    from gripper_force.jobs.grasp import GraspSummary
     from gripper_force.jobs.replay import Replays
     from gripper_force.progress import Progress, Prompt
     from gripper_force.runtime.log_reader import LogReader
@@ -162,7 +163,7 @@ def _grasp_trials(
     as_json: bool,
 ) -> None:
     from gripper_force.jobs import trials as job
-    from gripper_force.jobs.grasp import GraspSummary, exclusive_device
+    from gripper_force.jobs.grasp import exclusive_device
     from gripper_force.progress import no_progress
 
     device = exclusive_device(settings)
@@ -177,26 +178,17 @@ def _grasp_trials(
             soft_wrap=True,
         )
         prompt, lines = (console.prompt(yes) if pause else None), console.line
-    results: list[GraspSummary] = []
-    failure: BaseException | None = None
-    with console.bar("grasping", count, hidden=bool(device)) as progress:
-        try:
-            running = job.trials(
-                settings,
-                count,
-                workers,
-                objects=objects,
-                target_n=target_n,
-                same_object=same_object,
-                prompt=prompt,
-                progress=lines,
-            )
-            with closing(running) as finished:
-                for one in finished:
-                    results.append(one)
-                    progress(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
-        except (KeyboardInterrupt, GripperError) as end:
-            failure = end
+    running = job.trials(
+        settings,
+        count,
+        workers,
+        objects=objects,
+        target_n=target_n,
+        same_object=same_object,
+        prompt=prompt,
+        progress=lines,
+    )
+    results, failure = _finished(running, count, hidden=bool(device))
     if results and not (as_json and isinstance(failure, GripperError)):
         summary = job.summarise_trials(results, settings.control.force_limit_n)
         figure = job.write_figure(settings, results, summary)
@@ -208,6 +200,22 @@ def _grasp_trials(
     console.next_step("replay", worst["log"], "--report")
     if all(one["result"] != "held" for one in results):
         raise typer.Exit(1)
+
+
+def _finished(
+    running: "Generator[GraspSummary, None, None]", count: int, *, hidden: bool
+) -> tuple[list["GraspSummary"], BaseException | None]:
+    """Runs trials with a progress bar. Returns their results, and the error or interruption that ended them."""
+    results: list[GraspSummary] = []
+    with console.bar("grasping", count, hidden=hidden) as progress:
+        try:
+            with closing(running) as finished:
+                for one in finished:
+                    results.append(one)
+                    progress(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
+        except (KeyboardInterrupt, GripperError) as end:
+            return results, end
+    return results, None
 
 
 def _notes(settings: "Config", name: str) -> list[str]:

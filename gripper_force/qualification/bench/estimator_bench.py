@@ -179,6 +179,7 @@ def _measure(
 ) -> Iterator[EstimatorCost]:
     errors: dict[tuple[str, str], dict[str, float]] = {}
     frames = list(inputs_of(model, clips[0].frames))
+    networks = [member for member in model.header.members if isinstance(member, NetworkConfig)]
     for count in threads:
         engines = {}
         for file, engine, name, precision in variants:
@@ -204,11 +205,7 @@ def _measure(
                 p50_ms=float(p50_ms),
                 p99_ms=float(p99_ms),
                 frames_s=1e9 / float(np.mean(taken_ns)),
-                least_ms=None
-                if engine.startswith(WINDOW)
-                else roofs[name, count].least_ms(
-                    [m for m in model.header.members if isinstance(m, NetworkConfig)]
-                ),
+                least_ms=None,
                 memory_mb=None,
                 mae_n=errors[engine, name]["mae_n"],
                 rmse_n=errors[engine, name]["rmse_n"],
@@ -217,7 +214,8 @@ def _measure(
             )
             if not engine.startswith(WINDOW):
                 file, precision = next((f, p) for f, e, n, p in variants if (e, n) == (engine, name))
-                row = replace(row, memory_mb=_memory_mb(file, engine, precision, count))
+                least_ms = roofs[name, count].least_ms(networks)
+                row = replace(row, least_ms=least_ms, memory_mb=_memory_mb(file, engine, precision, count))
                 candidate = EngineCandidate(
                     source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n
                 )

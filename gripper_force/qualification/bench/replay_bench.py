@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -57,32 +58,22 @@ def bench(
     Raises:
         GripperError: A command failed, or two ways gave different results.
     """
-    seconds = sum(LogReader(path).duration_ns for path in find_logs(folder)) / NS_PER_S
+    log_s = sum(LogReader(path).duration_ns for path in find_logs(folder)) / NS_PER_S
     rows: dict[tuple[str, str, str], list[float]] = {}
     expected: dict[tuple[str, str], Any] = {}
     with _ray_cluster(processes) as address:
         ways = {"1 process": ["--jobs", "1"], f"{processes} processes": ["--jobs", str(processes)]}
         if address is not None:
             ways[f"Ray, {processes} workers"] = ["--ray", address]
-        for _ in range(rounds):
-            for checkpoint in checkpoints:
-                for command in COMMANDS:
-                    for where, options in ways.items():
-                        call = [
-                            *command.split(),
-                            str(folder),
-                            "--checkpoint",
-                            checkpoint,
-                            *options,
-                            "--json",
-                        ]
-                        begin_s = time.monotonic()
-                        result = _run(call)
-                        rate = seconds / (time.monotonic() - begin_s)
-                        rows.setdefault((command, checkpoint, where), []).append(rate)
-                        progress(f"{command}, {checkpoint}, {where}: {rate:.1f} times real time")
-                        if result != expected.setdefault((command, checkpoint), result):
-                            raise GripperError(f"{command} with {checkpoint} in {where} gave another result")
+        runs = product(range(rounds), checkpoints, COMMANDS, ways.items())
+        for _, checkpoint, command, (where, options) in runs:
+            begin_s = time.monotonic()
+            result = _run([*command.split(), str(folder), "--checkpoint", checkpoint, *options, "--json"])
+            rate = log_s / (time.monotonic() - begin_s)
+            rows.setdefault((command, checkpoint, where), []).append(rate)
+            progress(f"{command}, {checkpoint}, {where}: {rate:.1f} times real time")
+            if result != expected.setdefault((command, checkpoint), result):
+                raise GripperError(f"{command} with {checkpoint} in {where} gave another result")
     return [
         ReplayRate(*key, rates, expected[key[:2]]["mae_n"] if key[0].startswith("evaluate") else None)
         for key, rates in rows.items()

@@ -28,7 +28,7 @@ from gripper_force.jobs.imports.video import find_recordings, import_video
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
-from gripper_force.jobs.trials import summarise_trials, trials, with_same_object
+from gripper_force.jobs.trials import TrialsSummary, summarise_trials, trials, with_same_object
 from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.gaussian_process import GaussianProcess
@@ -198,6 +198,7 @@ def _key(cell: Cell) -> tuple[object, ...]:
 def _measured(
     cell: Cell, config: Config, grasps: int, folder: Path, workers: int, progress: Progress
 ) -> Cell:
+    """Touches, learns, tests vision on fresh touches, and grasps. A cell with too few data states its problem."""
     place = folder / f"{cell.rig} {cell.object} {cell.settings[:8]}".replace(",", "").replace(" ", "-")
     config = config.with_values(
         object=cell.object,
@@ -212,28 +213,8 @@ def _measured(
     other = with_same_object(config).with_values(seed=config.seed + _OTHER_SEEDS)
     test = list(record_touches(other, TESTS, TOUCH_PEAK_N, place / "test", progress=progress))
     begin_s = time.monotonic()
-    learned = ""
-    out = place / f"{cell.method}-{cell.touches}-{cell.network[:8]}".replace(" ", "-")
     try:
-        if cell.method == "calibrated":
-            profile = calibrate_object(config, cell.object, logs=touched, out=out.with_suffix(".yaml"))
-            config = config.with_values(calibration={"object": str(profile.profile_path)})
-        elif cell.method == "taught":
-            taught = teach(
-                config,
-                cell.object,
-                logs=touched,
-                folder=out,
-                out=place / f"bundle-{cell.touches}",
-                workers=workers,
-            )
-            learned = taught.learned
-            config = config.with_values(
-                calibration={"object": str((taught.bundle / "profile.yaml").absolute())},
-                vision={"checkpoint": str(taught.bundle / "network.safetensors")},
-            )
-        elif cell.method == "from scratch":
-            config = _scratch(config, cell.object, touched, out)
+        config, learned = _learned(cell, config, touched, place, workers)
     except DataError as error:  # too little to learn from: the method has no figure here
         return replace(cell, minutes=(time.monotonic() - begin_s) / 60, problem=str(error))
     minutes = (time.monotonic() - begin_s) / 60
@@ -242,22 +223,49 @@ def _measured(
     below = [b for b in found.per_bin if b.from_n < TOUCH_PEAK_N]
     mae_n = float(np.average([b.mae_n for b in below], weights=[b.frames for b in below]))
     result = replace(cell, mae_n=mae_n, minutes=minutes, learned=learned)
-    for feedback in ("fused", "vision") if grasps else ():
-        own = other.with_values(
-            seed=other.seed + _OTHER_SEEDS,
-            vision=config.vision,
-            calibration=config.calibration,
-            control={"feedback": feedback},
-        )
-        done = list(trials(own, grasps, 1, objects=(cell.object,), progress=progress))
-        figures = summarise_trials(done, own.control.force_limit_n)
-        if feedback == "fused":
-            result = replace(result, fused_percent=figures["median_error_percent"])
-        else:
-            result = replace(
-                result, vision_percent=figures["median_error_percent"], fell_back=figures["fell_back"]
-            )
-    return result
+    if not grasps:
+        return result
+    grasping = other.with_values(
+        seed=other.seed + _OTHER_SEEDS, vision=config.vision, calibration=config.calibration
+    )
+    fused, vision = (_grasped(grasping, feedback, grasps, progress) for feedback in ("fused", "vision"))
+    return replace(
+        result,
+        fused_percent=fused["median_error_percent"],
+        vision_percent=vision["median_error_percent"],
+        fell_back=vision["fell_back"],
+    )
+
+
+def _learned(
+    cell: Cell, config: Config, touched: Sequence[Path], place: Path, workers: int
+) -> tuple[Config, str]:
+    """Learns from the touches by the cell's method. Returns the configuration with it, and what `teach` learned."""
+    out = place / f"{cell.method}-{cell.touches}-{cell.network[:8]}".replace(" ", "-")
+    if cell.method == "calibrated":
+        return _calibrated(config, cell.object, touched, out), ""
+    if cell.method == "from scratch":
+        return _scratch(config, cell.object, touched, out), ""
+    if cell.method != "taught":
+        return config, ""
+    bundle = place / f"bundle-{cell.touches}"
+    taught = teach(config, cell.object, logs=touched, folder=out, out=bundle, workers=workers)
+    config = config.with_values(
+        calibration={"object": str((taught.bundle / "profile.yaml").absolute())},
+        vision={"checkpoint": str(taught.bundle / "network.safetensors")},
+    )
+    return config, taught.learned
+
+
+def _grasped(config: Config, feedback: str, grasps: int, progress: Progress) -> TrialsSummary:
+    config = config.with_values(control={"feedback": feedback})
+    done = list(trials(config, grasps, 1, objects=(config.object,), progress=progress))
+    return summarise_trials(done, config.control.force_limit_n)
+
+
+def _calibrated(config: Config, name: str, touched: Sequence[Path], out: Path) -> Config:
+    profile = calibrate_object(config, name, logs=touched, out=out.with_suffix(".yaml"))
+    return config.with_values(calibration={"object": str(profile.profile_path)})
 
 
 def _scratch(config: Config, name: str, touched: Sequence[Path], out: Path) -> Config:
@@ -265,9 +273,7 @@ def _scratch(config: Config, name: str, touched: Sequence[Path], out: Path) -> C
     clips = [replace(clip, set=clip.name) for clip in load_clips(list(touched), settings.preprocess)]
     network = out.with_suffix(".network.safetensors")
     train(settings, clips, network, validation_clips=clips)
-    config = config.with_values(vision={"checkpoint": str(network)})
-    profile = calibrate_object(config, name, logs=touched, out=out.with_suffix(".yaml"))
-    return config.with_values(calibration={"object": str(profile.profile_path)})
+    return _calibrated(config.with_values(vision={"checkpoint": str(network)}), name, touched, out)
 
 
 def _rows(file: Path) -> list[dict[str, Any]]:
