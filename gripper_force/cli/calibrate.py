@@ -274,7 +274,7 @@ def object_(
     job.check_before_touches(settings, name, out)
     if logs is None:
         _tell_existing(settings, touches, folder, fresh)
-        logs = _touches(settings, touches, peak_n, folder, pause)
+        logs = _touches(settings, touches, peak_n, folder, pause=pause, may_stop=True)
     else:
         logs = find_logs(logs)
         _tell_other_objects(name, logs)
@@ -415,14 +415,7 @@ def teach(
     try:
         if logs is None:
             _tell_existing(settings, touches, folder, fresh)
-            logs = []
-            with console.bar("touching", touches) as touching:
-                prompt = console.prompt(False, touching) if pause else None
-                for path in calibrate_object.record_touches(
-                    settings, touches, peak_n, folder, prompt=prompt, progress=touching
-                ):
-                    logs.append(path)
-                    touching(path.name)
+            logs = _touches(settings, touches, peak_n, folder, pause=pause, may_stop=False)
         else:
             logs = find_logs(logs)
             _tell_other_objects(name, logs)
@@ -506,7 +499,10 @@ def _tell_other_objects(name: str, logs: Sequence[Path]) -> None:
         console.warn(f"there are logs of {', '.join(sorted(others))} among those for {name}")
 
 
-def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:
+def _touches(
+    settings: "Config", touches: int, peak_n: float | None, folder: Path, *, pause: bool, may_stop: bool
+) -> list[Path]:
+    """Records touches and returns their logs; with ``may_stop`` Ctrl-C ends only them, and those so far are used."""
     from gripper_calibration.procedures import calibrate_object as job
 
     paths: list[Path] = []
@@ -519,7 +515,7 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
                 paths.append(path)
                 progress(path.name)
         except KeyboardInterrupt:
-            if not paths or process.interrupt_exit_code() != 128 + signal.SIGINT:
+            if not (may_stop and paths) or process.interrupt_exit_code() != 128 + signal.SIGINT:
                 raise  # SIGTERM and a lost terminal end the command, Ctrl-C only the touches
             console.err.print(f"stopped after {len(paths)} of {touches} touches; calibrating with these")
     return paths
