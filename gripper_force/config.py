@@ -382,7 +382,7 @@ class ControlConfig(Section):
     ramp_n_s: Positive = Field(8.0, description="rate at which the reference force rises after contact")
     settle_s: Positive = Field(1.0, description="time within tolerance after which a grasp counts as held")
     hold_s: NonNegative = Field(1.5, description="time for which `grasp` holds before it releases")
-    timeout_s: Positive = Field(8.0, description="time after which a grasp that is not held has timed out")
+    timeout_s: Positive = Field(8.0, description="time within which a grasp must be held; slow jaws get more")
     vision_rate_hz: Positive | None = Field(
         None, description="estimates per second that the loop is tuned for; null: camera.rate_hz"
     )
