@@ -138,7 +138,10 @@ def _network(config: Config) -> Iterator[Check]:
     median_ms, p99_ms = time_ms(lambda: estimator.update(gray), 50)
     found = f"median {median_ms:.1f} ms, p99 {p99_ms:.1f} ms of 50"
     frame_ms = 1e3 / config.camera.rate_hz
-    advice = f"slower than the frames at camera.rate_hz={config.camera.rate_hz:g}: close other programs"
+    advice = (
+        f"slower than the frames at camera.rate_hz={config.camera.rate_hz:g}: close other programs, or set "
+        "vision.engine=auto or vision.checkpoint=small"
+    )
     lockstep = config.clock == "lockstep"
     yield judged("network", "step", found, median_ms <= frame_ms, advice, harmless=lockstep)
 

@@ -104,6 +104,22 @@ def test_the_table_is_for_people(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
+@pytest.mark.parametrize(("median_ms", "good"), [(12.0, True), (70.0, False)])
+def test_a_network_that_is_slower_than_the_camera_has_alternatives(
+    median_ms: float, good: bool, quick_vision: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "time_ms", lambda *_: (median_ms, median_ms))
+    (step,) = (
+        check
+        for check in doctor._network(
+            load_config(None, [*quick_vision, "clock=realtime", "camera.rate_hz=20"])
+        )
+        if check.name == "step"
+    )
+    assert step.ok is good
+    assert ("vision.engine=auto" in step.advice) != good
+
+
 def test_a_wrong_key_is_bad_input() -> None:
     assert isinstance(run("--set", "servo.prot=x").exception, ConfigError)
 
