@@ -14,7 +14,6 @@ import numpy as np
 from gripper_force.config import Config
 from gripper_force.errors import GripperError
 from gripper_force.jobs.checks import Check, Confirm, PortScan, SetupResult, judged, time_ms
-from gripper_force.jobs.cpu import bfloat16_instructions
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.runtime.process import real_time_priority
@@ -122,6 +121,7 @@ def _network(config: Config) -> Iterator[Check]:
     if not config.uses_vision:
         yield Check("network", "step", "not needed: no camera or no checkpoint", None)
         return
+    from gripper_force.jobs.cpu import bfloat16_instructions
     from gripper_force.vision.step_benchmark import engine_version
 
     config, model, _ = resolve_vision(config)
