@@ -261,7 +261,7 @@ def evaluate(
     console.tell_missing_parquet(out)
     if settings.vision.precision == "bfloat16" and not bfloat16_instructions():
         console.warn(
-            "this CPU has no instructions for bfloat16, which makes it slower; leave vision.precision out"
+            "this CPU lists no instructions for bfloat16, so that it is slower than float32; leave vision.precision out"
         )
     with console.bar("evaluating", len(logs)) as progress:
         result = job(

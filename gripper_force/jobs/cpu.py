@@ -6,10 +6,10 @@ from gripper_force.vision.step_benchmark import cpu_info
 
 
 def bfloat16_instructions() -> str:
-    """Returns the name of the CPU's instructions for bfloat16, such as ``amx_bf16``; empty if it has none.
+    """Returns the name of the CPU's instructions for bfloat16, such as ``amx_bf16``; empty if the system lists none.
 
-    Linux tells them. PyTorch emulates bfloat16 on a CPU without them: a training then takes ten times as long as with
-    float32, or more.
+    Only Linux lists them. PyTorch emulates bfloat16 on a CPU without them: a training step then takes about ten times
+    as long as with float32.
     """
     found = re.search(r"\b\w*bf16\b", "\n".join(cpu_info()))
     return found[0] if found else ""

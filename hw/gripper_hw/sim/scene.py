@@ -314,7 +314,7 @@ def scene_mjcf(
 
 
 def _filled_template(scene: Scene, gripper: GripperConfig, model: ObjectModel, second: Scene | None) -> str:
-    """Returns the MJCF text of a scene; an object that has a file of its own MJCF is not yet in it."""
+    """Returns the MJCF text of a scene; an object with its own MJCF file is not yet in it."""
     grip_m = np.array([0.0, 0.0, model.grip_height_m])
     camera_m = grip_m + scene.camera_from_grip_m + scene.camera_offset_m
     aim_m = grip_m + scene.camera_aim_m + scene.camera_target_offset_m
@@ -364,7 +364,7 @@ def _filled_template(scene: Scene, gripper: GripperConfig, model: ObjectModel, s
 
 
 def _finger_coupling(second: Scene | None, radius_m: float, rail_height_m: float) -> dict[str, str]:
-    """Returns the parts of the template that couple the fingers, or drive the second one by a servo of its own."""
+    """Returns the parts of the template that couple the fingers, or drive the second one by its own servo."""
     if second is None:
         return {"coupling": _COUPLING, **dict.fromkeys(("second_horn", "second_rack", "second_motor"), "")}
     inertia_kg_m2, damping_nm_s, friction_nm, rail_friction_nm = horn_dynamics(second, radius_m, rails=1)
