@@ -23,7 +23,6 @@ from typing import Any, Final, TypedDict
 
 from gripper_force.errors import ConfigError, GripperError
 from gripper_force.progress import Progress, no_progress
-from gripper_force.qualification.fuzz import bus_targets, core_targets, load_cell_targets
 from gripper_force.qualification.fuzz.target import Target
 from gripper_force.qualification.proc_files import memory_bytes
 from gripper_force.types import NS_PER_S
@@ -115,6 +114,9 @@ class FuzzReport(TypedDict):
 
 def all_targets() -> list[Target]:
     """All targets of the project."""
+    # A process starts again after each crash; with other targets it does not need the readers, which take seconds.
+    from gripper_force.qualification.fuzz import bus_targets, core_targets, load_cell_targets
+
     return [*core_targets.TARGETS, *bus_targets.TARGETS, *load_cell_targets.TARGETS]
 
 
