@@ -21,7 +21,7 @@ from gripper_force.config import ServoConfig
 from gripper_force.errors import DeviceError, DeviceTimeoutError
 from gripper_force.interfaces import BusStats, Lock, SharedPort
 from gripper_hw.dynamixel.control_table import REGISTERS
-from gripper_hw.dynamixel.packets import BROADCAST_ID
+from gripper_hw.dynamixel.packets import BROADCAST_ID, Error
 from gripper_hw.dynamixel.port import BorrowedPort, Port, open_port
 
 _READ_LENGTHS: Final = 8
@@ -31,17 +31,7 @@ requests has another length. The longest request fills the 20 bytes of an XL330'
 _REPLY_TO_ALL: Final = 2
 """Status Return Level: a reply to every instruction."""
 
-_ERROR_CRC: Final = 3
 _ERROR_MASK: Final = 0x7F  # bit 7 is the alert; the read block contains the full hardware error
-_ERRORS: Final = {
-    1: "result fail",
-    2: "instruction error",
-    4: "data range error",
-    5: "data length error",
-    6: "data limit error",
-    7: "access error",
-}
-
 _T = TypeVar("_T")
 
 
@@ -288,7 +278,7 @@ def _check_result(description: str, result: int, error: int) -> int:
     number = error & _ERROR_MASK
     if result != COMM_SUCCESS or number == 0:
         return result
-    if number == _ERROR_CRC:
+    if number == Error.CRC:
         return int(COMM_RX_CORRUPT)  # the request was corrupted on the bus: retry
-    reason = _ERRORS.get(number, f"error {number}")
-    raise DeviceError(f"{description} was refused ({reason}); power-cycle the servo and start again")
+    name = Error(number).name.lower().replace("_", " ") if number in list(Error) else str(number)
+    raise DeviceError(f"{description} was refused ({name} error); power-cycle the servo and start again")
