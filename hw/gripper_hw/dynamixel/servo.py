@@ -1,7 +1,8 @@
 """Dynamixel servos in current-based position mode, over the vendor's unmodified SDK.
 
-A cycle is one fast sync read and one sync write for all servos of a bus, both through indirect addresses.
-Servos with older firmware are read by a plain sync read.
+A cycle is one fast sync read and one sync write for all servos of a bus, both through indirect addresses. An XL330 or
+XC330 has too few of them for the voltage, which is read on its own every 20 cycles. Servos with older firmware are
+read by a plain sync read.
 Registers: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/.
 """
 
@@ -10,6 +11,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import Final
 
 from gripper_force.config import ServoConfig
@@ -38,25 +40,21 @@ from gripper_hw.dynamixel.control_table import (
 from gripper_hw.dynamixel.fingers import FingerPair
 from gripper_hw.dynamixel.transport import PortLockedError, Transport
 
-_READ_FIELDS: Final = {  # name: bytes
-    "present_current": 2,
-    "present_velocity": 2,  # the upper two bytes only extend the sign, and an XL330 has only 20 bytes
-    "present_position": 4,
-    "hardware_error_status": 1,
-    "present_temperature": 1,
-    "present_input_voltage": 2,
-    "bus_watchdog": 1,
-}
-_READ_BLOCK: Final = struct.Struct("<hhiBBHb")
-CYCLE_BYTES: Final = _READ_BLOCK.size
-"""Bytes that a cycle reads from each servo."""
-
-_WRITE_FIELDS: Final = {"goal_current": 2, "goal_position": 4}
+_REGISTERS: Final = (  # with all their bytes: a part of a register does not work as indirect data
+    "present_current present_velocity present_position hardware_error_status present_temperature bus_watchdog "
+    "present_input_voltage goal_current goal_position"
+)
+_READ_BLOCK: Final = struct.Struct("<hiiBBb")
+_VOLTAGE: Final = struct.Struct("<H")
 _WRITE_BLOCK: Final = struct.Struct("<hi")
+CYCLE_BYTES: Final = _READ_BLOCK.size + _VOLTAGE.size
+"""Bytes that a cycle reads from each servo. Where they do not fit, the voltage has a transaction of its own."""
+
+_VOLTAGE_CYCLES: Final = 20
+"""Cycles between two readings of the voltage on its own."""
+
 _INDIRECT_ADDRESSES: Final = tuple(
-    REGISTERS[name].address + offset
-    for name, size in (_READ_FIELDS | _WRITE_FIELDS).items()
-    for offset in range(size)
+    REGISTERS[name].address + offset for name in _REGISTERS.split() for offset in range(REGISTERS[name].size)
 )
 _VOLTAGE_UNIT_V: Final = 0.1  # unit of Present Input Voltage
 
@@ -64,13 +62,8 @@ _MAX_TRAVEL_RAD: Final = 255 * 2 * math.pi  # Goal Position accepts 256 turns ei
 _TORQUE_OFF_TRIES: Final = 5
 MIN_FIRMWARE: Final = 38
 """The first firmware with Drive Mode and Bus Watchdog."""
-_HARDWARE_ERRORS: Final = {
-    0x01: "input voltage",
-    0x04: "overheating",
-    0x08: "motor encoder",
-    0x10: "electrical shock",
-    0x20: "overload",
-}
+# Names of the bits of Hardware Error Status.
+_ERRORS: Final = ("input voltage", "", "overheating", "motor encoder", "electrical shock", "overload")
 
 
 class DynamixelBus:
@@ -109,6 +102,8 @@ class DynamixelBus:
         self._watchdog_setting = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
         self._expected_watchdog = 0
         self._data_address = 0  # indirect data: the block that is read, followed by the block that is written
+        self._read_size = CYCLE_BYTES
+        self._voltages: Sequence[bytes] = ()  # those that are read on their own
 
     @property
     def stats(self) -> BusStats:
@@ -161,9 +156,14 @@ class DynamixelBus:
                 firmware.append(self._read_firmware(id_))
             self.firmware = tuple(firmware)
             window = self._common_window()
+            fits = (
+                window.length > CYCLE_BYTES + _WRITE_BLOCK.size
+            )  # a read may have 7 bytes more, a write has 6
+            self._read_size = CYCLE_BYTES if fits else _READ_BLOCK.size
             for id_ in self.ids:
                 self._configure(id_, window)
             self._data_address = window.data
+            self._voltages = ()
             states = self.read()
             check(states)
             for id_, state in zip(self.ids, states, strict=True):
@@ -183,15 +183,17 @@ class DynamixelBus:
             DeviceTimeoutError: No valid reply after every retry.
             DeviceLostError: The port is gone.
         """
-        t_ns, blocks = self._transport.sync_read(
-            self.ids,
-            self._data_address,
-            _READ_BLOCK.size,
-            fast=min(self.firmware, default=0) >= self.model.fast_sync_read_firmware,
-        )
+        fast = min(self.firmware, default=0) >= self.model.fast_sync_read_firmware
+        read = partial(self._transport.sync_read, self.ids, fast=fast)
+        apart = self._read_size < CYCLE_BYTES
+        if apart and (not self._voltages or self.stats.cycles % _VOLTAGE_CYCLES == 0):
+            self._voltages = read(_INDIRECT_ADDRESSES[_READ_BLOCK.size], _VOLTAGE.size)[1]
+        t_ns, blocks = read(self._data_address, self._read_size)
         self.stats.cycles += 1
+        voltages = self._voltages if apart else [block[_READ_BLOCK.size :] for block in blocks]
         return tuple(
-            self._decode_state(t_ns, id_, block) for id_, block in zip(self.ids, blocks, strict=True)
+            self._decode_state(t_ns, id_, block, voltage)
+            for id_, block, voltage in zip(self.ids, blocks, voltages, strict=True)
         )
 
     def write(self, commands: Sequence[ServoCommand]) -> None:
@@ -204,7 +206,7 @@ class DynamixelBus:
         """
         blocks = [self._encode_goals(command) for command in commands]
         self._transport.sync_write(
-            self._data_address + _READ_BLOCK.size, dict(zip(self.ids, blocks, strict=True))
+            self._data_address + self._read_size, dict(zip(self.ids, blocks, strict=True))
         )
 
     def stop(self, *, hold: bool) -> None:
@@ -302,7 +304,8 @@ class DynamixelBus:
         if pwm_limit == 0:
             raise DeviceError(f"servo {id_} has PWM Limit 0 and can't move; set the register to 885 (100 %)")
         self._transport.set(id_, "goal_pwm", pwm_limit)  # another program may have left 0
-        pointers = struct.pack(f"<{len(_INDIRECT_ADDRESSES)}H", *_INDIRECT_ADDRESSES)
+        addresses = _INDIRECT_ADDRESSES[: self._read_size] + _INDIRECT_ADDRESSES[CYCLE_BYTES:]
+        pointers = struct.pack(f"<{len(addresses)}H", *addresses)
         self._transport.write(id_, window.address, pointers)
         if self._transport.read(id_, window.address, len(pointers)) != pointers:
             raise DeviceError(
@@ -340,8 +343,8 @@ class DynamixelBus:
 
     # Cycle.
 
-    def _decode_state(self, t_ns: int, id_: int, block: bytes) -> ServoState:
-        current, velocity, ticks, hardware_error, temperature, voltage, watchdog = _READ_BLOCK.unpack(block)
+    def _decode_state(self, t_ns: int, id_: int, block: bytes, voltage: bytes) -> ServoState:
+        current, velocity, ticks, hardware_error, temperature, watchdog = _READ_BLOCK.unpack_from(block)
         if watchdog != self._expected_watchdog:
             reason = "its bus watchdog tripped" if watchdog < 0 else "it restarted and lost its settings"
             raise HardwareFaultError(
@@ -353,7 +356,7 @@ class DynamixelBus:
             velocity_rad_s=velocity * VELOCITY_UNIT_RAD_S,
             current_a=current * self.model.current_unit_a,
             temperature_c=float(temperature),
-            voltage_v=voltage * _VOLTAGE_UNIT_V,
+            voltage_v=_VOLTAGE.unpack(voltage)[0] * _VOLTAGE_UNIT_V,
             hardware_error=hardware_error,
         )
 
@@ -442,4 +445,5 @@ class DynamixelServo:
 
 def hardware_error_text(bits: int) -> str:
     """Names of the bits set in Hardware Error Status."""
-    return " and ".join(name for bit, name in _HARDWARE_ERRORS.items() if bits & bit) or f"error {bits:#x}"
+    names = (name for bit, name in enumerate(_ERRORS) if bits >> bit & 1 and name)
+    return " and ".join(names) or f"error {bits:#x}"

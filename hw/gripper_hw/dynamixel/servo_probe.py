@@ -179,7 +179,7 @@ class _Inspection:
             difference_rad = abs(self._pair.difference_rad(*positions_rad))
             advice = self._pair.start_problem(*positions_rad).rpartition("; ")[2]
             yield judged(unit, "fingers", f"{difference_rad:.3f} rad apart", not advice, advice)
-        start = REGISTERS["present_current"].address  # any address, but as many bytes as a cycle reads
+        start = REGISTERS["present_pwm"].address  # any address, but as many bytes as a cycle reads
         fast = firmware >= self.model.fast_sync_read_firmware
         median_ms, p99_ms = time_ms(
             lambda: self.transport.sync_read(ids, start, CYCLE_BYTES, fast=fast), _CYCLES

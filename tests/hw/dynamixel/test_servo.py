@@ -261,22 +261,49 @@ def test_register_that_does_not_keep_its_value_is_reported(memory_endpoint):
 
 
 @pytest.mark.parametrize(
-    ("model", "firmware", "data"),
-    [("XM430-W350", 52, 224), ("XL330-M288", 51, 224), ("XL330-M288", 52, 208), ("XC330-T288", 52, 208)],
+    ("model", "firmware", "data", "size"),
+    [
+        ("XM430-W350", 52, 224, 15),
+        ("XL330-M288", 51, 224, 15),
+        ("XL330-M288", 52, 208, 13),
+        ("XC330-T288", 52, 208, 13),
+    ],
 )
-def test_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmware, data):
+def test_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmware, data, size):
     endpoint = make_memory_endpoint(VirtualServo(1, load_model(model), firmware))
     servo = drive(endpoint, model=model, current_limit_a=0.9)
     servo.start()
+    mapped = struct.unpack(f"<{size + 6}H", endpoint.bus.servos[0].read(168, 2 * (size + 6))[1])
+    registers = [r for r in REGISTERS.values() if r.address in mapped]
+    # A register of which a part is mapped does not work: emanual.robotis.com/docs/en/dxl/x/xl330-m288/#indirect-data
+    assert sorted(mapped) == [r.address + offset for r in registers for offset in range(r.size)]
     endpoint.received.clear()
     servo.read()
     servo.write(command())
     read, write = endpoint.packets()
     assert (read.instruction, write.instruction) == (Instruction.FAST_SYNC_READ, Instruction.SYNC_WRITE)
     assert (read.params[:2], read.params[4:]) == (struct.pack("<H", data), b"\x01")
-    assert 13 <= int.from_bytes(read.params[2:4], "little") <= 20
-    assert write.params[:4] == struct.pack("<HH", data + 13, 6)
+    assert size <= int.from_bytes(read.params[2:4], "little") <= size + 7
+    assert write.params[:4] == struct.pack("<HH", data + size, 6)
     assert servo._bus.firmware == (firmware,)
+
+
+def test_voltage_that_does_not_fit_a_cycle_is_read_every_20_cycles(make_memory_endpoint):
+    endpoint = make_memory_endpoint(*(VirtualServo(id_, load_model("XL330-M288")) for id_ in (1, 2)))
+    bus = DynamixelBus(endpoint.config(model="XL330-M288"), (1, 2), lambda: endpoint.now_ns)
+    bus.start()
+    for servo, voltage_v in zip(endpoint.bus.servos, (4.8, 5.2), strict=True):
+        servo.set_conditions(voltage_v=voltage_v)
+    endpoint.received.clear()
+    voltages = [tuple(state.voltage_v for state in bus.read()) for _ in range(98)]
+    old, new = pytest.approx((5.0, 5.0)), pytest.approx((4.8, 5.2))
+    assert voltages == [old] * 18 + [new] * 80
+    reads = [packet.params[:2] for packet in endpoint.packets()]
+    assert reads.count(struct.pack("<H", REGISTERS["present_input_voltage"].address)) == 4
+    assert len(reads) == 102
+    bus.close()
+    bus.start()
+    assert [state.voltage_v for state in bus.read()] == new
 
 
 @pytest.mark.parametrize(("firmwares", "fast"), [((45, 52), True), ((44, 52), False), ((44, 38), False)])
