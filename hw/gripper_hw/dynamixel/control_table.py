@@ -4,7 +4,7 @@ import math
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self, TypedDict, cast
+from typing import Final, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -18,7 +18,7 @@ WATCHDOG_UNIT_MS: Final = 20
 FULL_PWM: Final = 885  # 100 % duty
 CURRENT_BASED_POSITION_MODE: Final = 5
 INPUT_VOLTAGE_ERROR: Final = 0x01
-"""The only hardware error that leaves torque on (https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/#shutdown)."""
+"""The only hardware error that leaves torque on, except on an XL330: see `ServoModel.stopping_errors`."""
 CYCLE_WINDOW_BYTES: Final = 20  # of indirect data that a cycle reads and writes
 
 _TICKS_PER_RAD: Final = TICKS_PER_REV / (2 * math.pi)
@@ -147,6 +147,15 @@ class ServoModel(Section):
         return self.setting("position_p_gain") / 128 / FULL_PWM * _TICKS_PER_RAD
 
     @property
+    def stopping_errors(self) -> int:
+        """Bits of Hardware Error Status that may turn torque off, with the factory's Shutdown.
+
+        See https://emanual.robotis.com/docs/en/dxl/x/xl330-m288/#shutdown. An error of the motor's encoder is not in
+        Shutdown, but no motor is controlled without its encoder.
+        """
+        return ~INPUT_VOLTAGE_ERROR & 0xFF | self.setting("shutdown")
+
+    @property
     def max_current_a(self) -> float:
         """Highest Current Limit."""
         return self.setting("current_limit") * self.current_unit_a
@@ -246,14 +255,10 @@ def _no_current_control(name: str) -> str:
     )
 
 
-class _SharedFile(TypedDict):
-    registers: dict[str, list[Any]]
-    without_current_control: dict[str, int]
-
-
 @cache
-def _shared() -> _SharedFile:
-    return cast(_SharedFile, read_tree(_FOLDER / _SHARED))
+def _shared() -> Tree:
+    """Returns the registers' rows by name, and numbers by name of models without current control."""
+    return read_tree(_FOLDER / _SHARED)
 
 
 def _registers() -> dict[str, Register]:

@@ -12,7 +12,7 @@ from gripper_force.config import ServoConfig
 from gripper_force.control.safety import exceeds_goal_current, is_back_driven
 from gripper_force.errors import DeviceError, HardwareFaultError
 from gripper_force.types import ServoCommand, ServoState
-from gripper_hw.dynamixel.control_table import INPUT_VOLTAGE_ERROR, VELOCITY_UNIT_RAD_S, ServoModel
+from gripper_hw.dynamixel.control_table import VELOCITY_UNIT_RAD_S, ServoModel
 
 _STANDING_RAD_S: Final = 1.5 * VELOCITY_UNIT_RAD_S
 """A finger that is not faster stands: one unit is noise."""
@@ -46,6 +46,7 @@ class FingerPair:
     def __init__(self, config: ServoConfig, model: ServoModel) -> None:
         self._config, self._ids = config.second, config.ids
         self._sign = -1 if config.second.mirrored else 1
+        self._stopping_errors = model.stopping_errors
         self._a_per_rad = model.position_loop_per_rad * model.stall_current_a
         self._states: tuple[ServoState, ServoState] | None = None
         self._kept_half_rad = 0.0  # half of the distance that the fingers keep
@@ -139,7 +140,7 @@ class FingerPair:
             leads_rad[ahead] = min(max(leads_rad[ahead], -shorter_rad), shorter_rad)
             left_a = max(goal_a - abs(self._states[ahead].current_a), 0.0)
             self._goals_a[1 - ahead] = min(goal_a + (1 - max(share, 0.0)) * left_a, _MAX_CURRENT * goal_a)
-        if any(state.hardware_error & ~INPUT_VOLTAGE_ERROR for state in self._states):
+        if any(state.hardware_error & self._stopping_errors for state in self._states):
             self._goals_a = [0.0, 0.0]  # one finger alone would push the object and the other one away
         goals_rad = (
             first.position_rad + leads_rad[0],

@@ -297,6 +297,25 @@ def test_an_input_voltage_error_keeps_the_grip(bench: Bench) -> None:
     assert all(bench.registers("goal_current"))
 
 
+@pytest.mark.parametrize(
+    ("model", "holds"),
+    [("XM430-W350", True), ("XC330-T288", True), ("XL330-M288", False), ("XL330-M077", False)],
+)
+def test_an_input_voltage_error_stops_both_if_it_stops_one(model: str, holds: bool) -> None:
+    servo = VirtualServo(1, load_model(model))
+    servo.set("torque_enable", 1)
+    servo.raise_hardware_error(INPUT_VOLTAGE_ERROR)
+    assert servo.get("torque_enable") == holds
+    pair = FingerPair(PAIR, load_model(model))
+    state = ServoState(0, 0.0, 0.0, 0.0, 30.0, 5.0, 0)
+    pair.start((state, replace(state, position_rad=OFFSET_RAD)))
+    pair.combine(
+        (replace(state, hardware_error=INPUT_VOLTAGE_ERROR), replace(state, position_rad=OFFSET_RAD))
+    )
+    first, second = pair.split(ServoCommand(0, 0.5, 0.3))
+    assert (first.goal_current_a > 0, second.goal_current_a > 0) == (holds, holds)
+
+
 @pytest.mark.parametrize("bench", [[{"unit": "plant", "kind": "wrong", "id": 2, "at_s": 0.4}]], indirect=True)
 def test_excess_current_of_one_motor_is_not_halved(bench: Bench) -> None:
     bench.servo.start()
