@@ -22,8 +22,11 @@ ATTACH_TIMEOUT_MS: Final = 2000
 
 _TIMED_OUT: Final = 3
 """``ErrorCode.EPHIDGET_TIMEOUT``"""
-_OUT_OF_RANGE: Final = 4103
-"""``ErrorEventCode.EEPHIDGET_OUTOFRANGE``"""
+_OUT_OF_RANGE: Final = frozenset({4103, 4105, 4114, 4115})
+"""``ErrorEventCode.EEPHIDGET_OUTOFRANGE``, ``_SATURATION``, ``_OUTOFRANGEHIGH`` and ``_OUTOFRANGELOW``."""
+
+_MAX_RATIO: Final = 0.995 / 128
+"""Largest ratio at the gain of 128. A 1046_1 sends a ratio beyond its range after the error, a 1046_0 sends none."""
 
 
 class PhidgetLoadCell(LiveLoadCell):
@@ -91,10 +94,10 @@ class PhidgetLoadCell(LiveLoadCell):
             self._channel = None
 
     def _sampled(self, _channel: Any, ratio: float) -> None:
-        self._add(ratio)
+        self._add(ratio, saturated=not abs(ratio) <= _MAX_RATIO)
 
     def _failed(self, _channel: Any, code: int, _text: str) -> None:
-        if code == _OUT_OF_RANGE:
+        if code in _OUT_OF_RANGE:
             self._add(math.nan, saturated=True)
 
     def _detached(self, _channel: Any) -> None:

@@ -56,6 +56,35 @@ def test_ratios_become_samples_and_out_of_range_is_saturation(
     cell.close()
 
 
+@pytest.mark.parametrize("code", [4103, 4105, 4114, 4115])
+def test_each_error_for_a_reading_out_of_range_is_saturation(
+    phidget_library: SimpleNamespace, code: int
+) -> None:
+    cell = make_cell()
+    cell.start()
+    (channel,) = phidget_library.VoltageRatioInput.made
+    channel.told["OnErrorHandler"](
+        channel, code, "The sensor reading is too high for the selected gain mode."
+    )
+    assert cell.stats.saturated == 1
+    cell.close()
+
+
+@pytest.mark.parametrize("ratio", [1 / 128, -1 / 128, 0.05, math.inf, math.nan])
+def test_ratio_beyond_the_range_of_the_gain_is_saturation(
+    phidget_library: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, ratio: float
+) -> None:
+    monkeypatch.setattr("gripper_hw.load_cells.screening.MAX_WAIT_NS", 0)
+    cell = make_cell()
+    cell.start()
+    (channel,) = phidget_library.VoltageRatioInput.made
+    channel.told["OnVoltageRatioChangeHandler"](channel, ratio)
+    channel.told["OnVoltageRatioChangeHandler"](channel, 0.0077)
+    assert [s.valid for s in cell.drain()] == [False, True]
+    assert cell.stats.saturated == 1
+    cell.close()
+
+
 @pytest.mark.parametrize(
     ("code", "error", "message"),
     [
