@@ -14,7 +14,7 @@ HX711_MAX: Final = 0x7FFFFF
 
 _HX711: Final = re.compile(
     rb"\s*(?:\d+,|[A-Za-z][^:=|]*[:=]|[A-Za-z][A-Za-z_ ]*\s)?"
-    rb"\s*([+-]?\d{1,8})(\.\d*)?\s*([A-Za-z]{1,3})?\s*(?:\|.*)?"
+    rb"\s*([+-]?\d{1,8})(\.\d*)?\s*(?:([A-Za-z]{1,3})|,([A-Za-z]{2,3})(?:,.*)?)?\s*(?:\|.*)?"
 )
 _CAS: Final = re.compile(rb"(?:(ST|US|OL),(?:GS|NT),(?:..,)?)?(.{8})(?: ?(kg|g | g))?", re.DOTALL)
 _CAS_LENGTHS: Final = frozenset({8, 16, 20})
@@ -42,8 +42,9 @@ def parse_hx711(line: bytes) -> Reading | None:
 
     It is ``<raw>`` or ``<micros>,<raw>`` in counts, or a value that the board has scaled, such as ``12.34``,
     with or without a name before it and a unit behind it: ``HX711 reading: 8421``, ``Weight: 12 g``. What
-    follows a bar is not used: ``one reading: -0.4 | average: -0.2``. The unit is not converted:
-    `load_cell.n_per_raw` is newtons per unit of the value. See
+    follows a bar is not used: ``one reading: -0.4 | average: -0.2``. Nor is what follows the unit in a line of
+    SparkFun's OpenScale (https://github.com/sparkfun/OpenScale): ``<millis>,12.34,kg,24.50,``. The unit is not
+    converted: `load_cell.n_per_raw` is newtons per unit of the value. See
     https://cdn.sparkfun.com/datasheets/Sensors/ForceFlex/hx711_english.pdf for the counts.
 
     Returns:
@@ -52,7 +53,7 @@ def parse_hx711(line: bytes) -> Reading | None:
     found = _HX711.fullmatch(line)
     if found is None:
         return None
-    if found[2] is not None or found[3] is not None:
+    if any(part is not None for part in found.groups()[1:]):
         return Reading(float(found[1] + (found[2] or b"")), rounded=True)
     if not HX711_MIN <= (raw := int(found[1])) <= HX711_MAX:
         return None

@@ -59,6 +59,12 @@ def test_scaled_values_of_boards_are_parsed() -> None:
         (b"Load cell 1 (N) = 3.1 N", 3.1),
         (b"one reading:\t-0.4\t| average:\t-0.2\r", -0.4),
         (b"Weight: 12 g\r", 12.0),
+        # SparkFun's OpenScale with and without its time, raw counts and temperatures.
+        (b"1245,0.31,lbs,\r", 0.31),
+        (b"-0.0312,kg,\r", -0.0312),
+        (b"3,kg,", 3.0),
+        (b"77,12.34,kg,8355808,24.50,0,\r", 12.34),
+        (b"77,12.34,kg\r", 12.34),
     ]:
         assert parse_hx711(line) == Reading(raw, rounded=True)
     # The basic example of https://github.com/bogde/HX711 has digits in its name.
