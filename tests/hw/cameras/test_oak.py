@@ -319,6 +319,20 @@ def test_camera_can_be_opened_repeatedly(make_oak: MakeOak, take: Take) -> None:
         camera.close()
 
 
+@pytest.mark.parametrize(("set_to", "dumps"), [(None, "0"), ("/tmp", "/tmp")])
+def test_a_lost_device_is_not_started_for_a_crash_dump(set_to: str | None, dumps: str) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "DEPTHAI_CRASHDUMP"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import os, gripper_hw.cameras; print(os.environ['DEPTHAI_CRASHDUMP'])"],
+        env=environment | ({"DEPTHAI_CRASHDUMP": set_to} if set_to else {}),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stdout.strip() == dumps
+
+
 def test_depthai_does_not_report_its_use() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "DEPTHAI_TELEMETRY"}
     code = "from gripper_hw.cameras.oak import dai; dai.Device.getAllAvailableDevices()"
