@@ -27,13 +27,19 @@ _BUFFERS = 2
 _EXPOSURE_MANUAL = 1
 """V4L2_EXPOSURE_MANUAL."""
 
+_EXPOSURES_FIXED = (_EXPOSURE_MANUAL, 2)
+"""The other one is V4L2_EXPOSURE_SHUTTER_PRIORITY, in which only the iris is automatic."""
+
+_EXPOSURES_AUTOMATIC = (3, 0)
+"""V4L2_EXPOSURE_APERTURE_PRIORITY, which most cameras have, and V4L2_EXPOSURE_AUTO."""
+
 _EXPOSURE_UNIT_US = 100
 """Unit of V4L2_CID_EXPOSURE_ABSOLUTE."""
 
 _TOLERANCE = 0.1
 """Largest relative difference between a control's set and read value: drivers round to their own steps."""
 
-_NOT_SUPPORTED = -1.0
+_MISSING = -1.0
 """Value of a control that the device does not have."""
 
 _CONTROLS = (
@@ -101,13 +107,14 @@ class UvcCamera(BackgroundCamera):
             for _ in range(_BUFFERS):  # filled before the controls were set
                 _image(capture, path)
             self._settings = {"fourcc": fourcc, "resolution_px": size_px, **controls}
-            numbers = count(1 + _BUFFERS)  # the first image told the size
+            numbers = count(1 + _BUFFERS)  # the first image began the stream
             yield lambda: self._read(capture, path, next(numbers))
         finally:
             capture.release()
 
-    def _read(self, capture: Any, path: Path, seq: int) -> RawFrame:
-        image = _image(capture, path)
+    def _read(self, capture: Any, path: Path, seq: int) -> RawFrame | None:
+        if (image := _image(capture, path)) is None:
+            return None
         stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
         if not 0 <= self._clock.now_ns() - stamp_ns < _MAX_FRAME_AGE_NS:
             raise DeviceError(
@@ -170,7 +177,8 @@ def _set_format(capture: Any, path: Path, config: CameraConfig) -> tuple[str, st
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.resolution_px[0])
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.resolution_px[1])
     capture.set(cv2.CAP_PROP_FPS, config.rate_hz)
-    height, width = _image(capture, path).shape[:2]
+    _image(capture, path)  # begins the stream
+    width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     code, rate_hz = int(capture.get(cv2.CAP_PROP_FOURCC)), capture.get(cv2.CAP_PROP_FPS)
     fourcc = (code & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1")
     rate_known = 0 < rate_hz < math.inf
@@ -194,32 +202,41 @@ def _set_controls(capture: Any, path: Path, config: CameraConfig) -> Settings:
     for key, control, unit, automatic, off in _CONTROLS:
         value = getattr(config, key)
         if key == "exposure_us" and value is None:
+            for mode in _EXPOSURES_AUTOMATIC:  # a camera that is closed keeps what an earlier run has set
+                if capture.get(automatic) in _EXPOSURES_FIXED:
+                    capture.set(automatic, mode)
+            if capture.get(automatic) in _EXPOSURES_FIXED:
+                raise DeviceError(f"{path} refuses automatic exposure; set camera.exposure_us")
             settings[key] = "automatic"
             continue
         steps = []
-        if automatic is not None and capture.get(automatic) != _NOT_SUPPORTED:
+        if automatic is not None and capture.get(automatic) != _MISSING:
             steps.append((automatic, off, 1, f"to stop automatic camera.{key}"))
         if value is not None:
             steps.append((control, value, unit, f"camera.{key}"))
-        for one, wanted, one_unit, what in steps:
-            capture.set(one, round(wanted / one_unit))
-            if abs((got := capture.get(one)) * one_unit - wanted) > _TOLERANCE * wanted:
-                read = (
-                    "no such control"
-                    if got == _NOT_SUPPORTED
-                    else f"{wanted} was set, {got * one_unit:g} is read"
-                )
+        for one, wanted, scale, what in steps:
+            capture.set(one, round(wanted / scale))
+            if abs((got := capture.get(one)) * scale - wanted) > _TOLERANCE * wanted:
+                read = "no such control" if got == _MISSING else f"{wanted} was set, {got * scale:g} is read"
                 raise DeviceError(
                     f"{path} refuses {what}: {read}; set another value, or null (v4l2-ctl -d {path} -L lists its "
                     "controls and their ranges)"
                 )
-        if (got := capture.get(control)) != _NOT_SUPPORTED:
+        if (got := capture.get(control)) != _MISSING:
             settings[key] = got * unit
     return settings
 
 
 def _image(capture: Any, path: Path) -> Any:
-    received, image = capture.read()
-    if not received:
+    """Returns the next image, or None if it cannot be decoded. Raises `DeviceLostError`.
+
+    A disturbed transfer gives a truncated or empty MJPG image: OpenCV has no result for the one, and an assertion fails
+    for the other. The next image is good.
+    """
+    if not capture.grab():
         raise DeviceLostError(f"{path} gives no frames; check its cable, and that no other program uses it")
-    return image
+    try:
+        received, image = capture.retrieve()
+    except cv2.error:
+        return None
+    return image if received else None

@@ -100,10 +100,12 @@ class FileCapture:
         refused: frozenset[int] = frozenset(),
         missing: frozenset[int] = frozenset(),
         formats: Formats | None = None,
+        controls: dict[int, float] | None = None,
+        spoilt: dict[int, str] | None = None,
     ) -> None:
         self.path, self.plugged, self.refused = path, plugged, refused
         self.capture = cv2.VideoCapture(path if plugged.is_set() else "/none")
-        controls = {
+        initial = {
             cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
             cv2.CAP_PROP_EXPOSURE: 157.0,
             cv2.CAP_PROP_GAIN: 8.0,
@@ -111,8 +113,8 @@ class FileCapture:
             cv2.CAP_PROP_FOCUS: 35.0,
             cv2.CAP_PROP_AUTO_WB: 1.0,
             cv2.CAP_PROP_WB_TEMPERATURE: 4300.0,
-        }
-        self.initial = {control: value for control, value in controls.items() if control not in missing}
+        } | (controls or {})
+        self.initial = {control: value for control, value in initial.items() if control not in missing}
         self.controls = dict(self.initial)
         self.formats = formats or {"YUYV": {(320, 240): 1000.0}}
         self.fourcc = next(iter(self.formats))
@@ -121,6 +123,7 @@ class FileCapture:
         self.fps = 30.0
         self.timestamp_ms = 0.0
         self.streams = False
+        self.spoilt, self.grabbed = spoilt or {}, 0
 
     def isOpened(self) -> bool:  # noqa: N802
         return bool(self.capture.isOpened())
@@ -153,16 +156,25 @@ class FileCapture:
             cv2.CAP_PROP_POS_MSEC: self.timestamp_ms,
             cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*self.fourcc)),
             cv2.CAP_PROP_FPS: self.fps,
+            cv2.CAP_PROP_FRAME_WIDTH: self.size[0],
+            cv2.CAP_PROP_FRAME_HEIGHT: self.size[1],
         }
         return formats.get(control, self.controls.get(control, -1.0))
 
-    def read(self) -> tuple[bool, Any]:
+    def grab(self) -> bool:
         time.sleep(0.01)
         if not self.streams:
             self.streams, self.controls = True, dict(self.initial)
         self.timestamp_ms = time.monotonic_ns() / 1e6
-        if not self.plugged.is_set():
-            return False, None
+        self.grabbed += 1
+        return self.plugged.is_set()
+
+    def retrieve(self) -> tuple[bool, Any]:
+        match self.spoilt.get(self.grabbed):
+            case "truncated":
+                return False, None
+            case "empty":
+                raise cv2.error("(-215:Assertion failed) !buf.empty() in function 'imdecode_'")
         received, image = self.capture.read()
         if not received:
             self.capture.release()
@@ -221,11 +233,15 @@ def make_uvc(plugged: threading.Event, video: Path) -> Callable[..., UvcCamera]:
         refused: frozenset[int] = frozenset(),
         missing: frozenset[int] = frozenset(),
         formats: Formats | None = None,
+        controls: dict[int, float] | None = None,
+        spoilt: dict[int, str] | None = None,
         **config: Any,
     ) -> UvcCamera:
         section = CameraConfig(backend="uvc", **{"device": str(video)} | config)
-        return UvcCamera(
-            section, MonotonicClock(), lambda path: FileCapture(path, plugged, refused, missing, formats)
-        )
+
+        def open_capture(path: str) -> FileCapture:
+            return FileCapture(path, plugged, refused, missing, formats, controls, spoilt)
+
+        return UvcCamera(section, MonotonicClock(), open_capture)
 
     return make

@@ -13,7 +13,7 @@ from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.session import open_run
 from gripper_force.types import NS_PER_MS, Frame
-from gripper_hw.cameras import uvc
+from gripper_hw.cameras import reader, uvc
 from gripper_hw.cameras.uvc import UvcCamera, find_device
 
 Take = Callable[..., list[Frame]]
@@ -137,6 +137,53 @@ def test_exposure_can_be_automatic(make_uvc: MakeUvc) -> None:
     camera = make_uvc(frozenset({cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE}), exposure_us=None)
     assert started(camera).controls[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
     assert camera.settings()["exposure_us"] == "automatic"
+
+
+@pytest.mark.parametrize("has", [{3}, {0}])
+def test_exposure_is_automatic_again_after_a_run_with_a_fixed_one(
+    make_uvc: MakeUvc, has: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = make_uvc(controls={cv2.CAP_PROP_AUTO_EXPOSURE: 1.0}, exposure_us=None)
+    open_capture = camera._open_capture
+
+    def limited(path: str) -> Any:
+        capture = open_capture(path)
+        accepts = capture.set
+        capture.set = lambda control, value: (
+            (control != cv2.CAP_PROP_AUTO_EXPOSURE or value in has) and accepts(control, value)
+        )
+        return capture
+
+    monkeypatch.setattr(camera, "_open_capture", limited)
+    assert started(camera).controls[cv2.CAP_PROP_AUTO_EXPOSURE] in has
+    assert camera.settings()["exposure_us"] == "automatic"
+
+
+def test_exposure_that_stays_fixed_is_an_error(make_uvc: MakeUvc) -> None:
+    control = cv2.CAP_PROP_AUTO_EXPOSURE
+    camera = make_uvc(frozenset({control}), controls={control: 1.0}, exposure_us=None)
+    with pytest.raises(DeviceError, match=r"refuses automatic exposure; set camera\.exposure_us"):
+        camera.start()
+    camera.close()
+
+
+def test_images_that_cannot_be_decoded_are_skipped(make_uvc: MakeUvc, take: Take) -> None:
+    spoilt = {1: "truncated", 2: "empty", 3: "truncated", 8: "truncated", 10: "empty"}
+    camera = make_uvc(spoilt=spoilt)
+    camera.start()
+    take(camera, 8)
+    camera.close()
+    assert camera.counts() == {"losses": 0}
+
+
+def test_camera_whose_images_cannot_be_decoded_is_an_error(
+    make_uvc: MakeUvc, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "_FIRST_FRAME_TIMEOUT_NS", 100 * NS_PER_MS)
+    camera = make_uvc(spoilt=dict.fromkeys(range(1, 9999), "truncated"))
+    with pytest.raises(DeviceError, match="gave no frame for 100 ms; check its cable"):
+        camera.start()
+    camera.close()
 
 
 def test_gain_without_exposure_is_refused(make_uvc: MakeUvc) -> None:
