@@ -65,9 +65,7 @@ class ServoConfig(Section):
         "XM430-W350",
         description="model, e.g. XM430-W350 or XC330-T288-T, or the path of a YAML file (page Servos)",
     )
-    port: str = Field(
-        "virtual:rig", description="device path, or virtual:NAME for a simulated bus in this process"
-    )
+    port: str = Field("virtual:rig", description="device path; virtual:NAME: a simulated bus in this process")
     id: int = Field(1, ge=0, le=252, description="id of the servo on the bus")
     baud_rate: int = Field(1_000_000, gt=0, description="bits per second")
     current_limit_a: Positive = Field(1.2, description="Current Limit register of the servo")
@@ -503,9 +501,7 @@ class SimCameraConfig(Section):
     fov_deg: float = Field(17.0, ge=2, le=120, description="field of view from edge to edge of the image")
     roll_deg: float = Field(0.0, ge=-180, le=180, description="rotation of the camera about its optical axis")
     blur_px: float = Field(0.0, ge=0, le=10, description="standard deviation of the lens's blur")
-    noise: Share | None = Field(
-        None, description="photon noise of a white pixel; null: drawn, 0.012 to 0.024"
-    )
+    noise: Share | None = Field(None, description="photon noise of white pixels; null: drawn, 0.012 to 0.024")
 
 
 class SimJawsConfig(Section):
@@ -540,35 +536,27 @@ class SimConfig(Section):
     camera: SimCameraConfig = SimCameraConfig()
     jaws: SimJawsConfig = SimJawsConfig()
     light: SimLightConfig = SimLightConfig()
-    object: Path | None = Field(
-        None, description="file of the simulated object; object=FOLDER/mug.yaml sets it"
-    )
+    object: Path | None = Field(None, description="file of the object; object=FOLDER/mug.yaml sets it")
     detail: Literal["coarse", "medium", "fine", "auto"] = Field(
         "medium",
         description="mesh and time step; auto: the fastest level that keeps budget.sim_error_n and "
         "budget.sim_speed by the table of `gripper-force bench scene`",
     )
-    lux: Positive | None = Field(
-        None, description="light level in lux; null: 350, 550 or 750, drawn from the seed"
-    )
+    lux: Positive | None = Field(None, description="light level; null: 350, 550 or 750, drawn from the seed")
     tool: Literal["pads", "discs", "rods"] = Field(
         "pads",
         description="jaw tips: flat pads, flat round discs, or rods with round tips, which press the wall of a turned "
         "object where the edge of a pad would catch on its rim",
     )
     yaw_deg: float = Field(0.0, ge=-90, le=90, description="rotation of the object, added to the drawn one")
-    randomise: bool = Field(
-        True, description="draw size, pose, camera, texture, light and motor from the seed"
-    )
+    randomise: bool = Field(True, description="draw size, pose, camera, texture, light and motor by seed")
     object_seed: int | None = Field(None, ge=0, description="seed of size, stiffness and texture; null: seed")
     rig_seed: int | None = Field(
         None,
         ge=0,
         description="seed of the gripper and its surroundings (camera, light, table, motor, gears, rods); null: seed",
     )
-    size_spread: float = Field(
-        0.04, ge=0, le=0.15, description="half-width of the uniform spread of the size"
-    )
+    size_spread: float = Field(0.04, ge=0, le=0.15, description="half-width of the uniform spread of size")
     stiffness_spread: float = Field(0.05, ge=0, le=0.5, description="the same of the object's stiffness")
     stiffness_octaves: float = Field(
         0.0, ge=0, le=1, description="further, log-uniform spread; 1: factors 0.5 to 2"

@@ -92,9 +92,8 @@ class LogQueue:
             write()
         except LogError as error:
             self._lose(str(error))
-        except (
-            Exception
-        ) as error:  # if the thread ended here, all later records would be lost without a message
+        # If the thread ended here, all later records would be lost without a message.
+        except Exception as error:
             self._lose(f"{type(error).__name__}: {error}")
 
     def _lose(self, why: str) -> None:
