@@ -8,7 +8,7 @@ from math import isclose
 from os import PathLike
 from os.path import expanduser
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Self, TypeVar, dataclass_transform, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -25,6 +25,9 @@ Tree = dict[str, Any]
 """A mapping of keys to values and subtrees, as read from YAML."""
 
 
+# Type checkers without a plugin for pydantic see a default in Field(default=1.2), but not in Field(1.2). This makes
+# them take each Field(...) for a default, so that users can write ServoConfig(id=2).
+@dataclass_transform(kw_only_default=True)
 class Section(BaseModel):
     """Base class of every section: immutable; an unknown key is an error.
 

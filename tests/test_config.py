@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -5,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import gripper_force
 from gripper_force.config import (
     HARD_FORCE_LIMIT_N,
     Config,
@@ -274,6 +278,29 @@ def test_overrides_may_be_a_mapping() -> None:
     assert load_config(None, {"control.rate_hz": 100.0, "object": "tube"}) == load_config(
         None, ["control.rate_hz=100", "object=tube"]
     )
+
+
+@pytest.mark.timeout(600)  # mypy without a cache
+def test_a_type_checker_without_a_plugin_knows_the_defaults(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "from gripper_force.config import CameraConfig, Config, LoadCellConfig, ServoConfig\n"
+        "Config(target_n=3, servo=ServoConfig(port='/dev/ttyUSB0'), camera=CameraConfig(backend='mine'))\n"
+        "LoadCellConfig()\n"
+        "ServoConfig(id='one')\n"
+    )
+    (tmp_path / "mypy.ini").write_text("[mypy]\nstrict = True\nfollow_imports = silent\n")
+    options = ["--config-file", tmp_path / "mypy.ini", "--cache-dir", tmp_path / "cache"]
+    environment = {**os.environ, "MYPYPATH": str(Path(gripper_force.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *map(str, options), program],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert [line.partition(": ")[2] for line in done.stdout.splitlines()[:-1]] == [
+        'error: Argument "id" to "ServoConfig" has incompatible type "str"; expected "int"  [arg-type]'
+    ], done.stdout + done.stderr
 
 
 def test_a_configuration_of_version_0_1_with_the_compiled_engine_is_read() -> None:

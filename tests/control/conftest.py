@@ -131,7 +131,7 @@ def draw_run(seed: int, **control: object) -> Run:
         contact_m=float(rng.uniform(0.008, 0.014)),
     )
     vision = make_vision(noise_n=float(rng.uniform(0.05, 0.15)), gain=float(rng.uniform(0.95, 1.05)))
-    return Run(ControlConfig(**control), plant, vision, seed)
+    return Run(ControlConfig.model_validate(control), plant, vision, seed)
 
 
 @pytest.fixture(scope="session")

@@ -177,7 +177,9 @@ def test_every_kind_is_drawn() -> None:
 @given(data=st.data())
 def test_any_geometry_is_refused_or_has_all_properties_of_a_linkage(kind: str, data: st.DataObject) -> None:
     keys, open_width_m = KINDS[kind](data.draw)
-    config = GripperConfig(linkage=LinkageConfig(kind=kind, **keys), open_width_m=open_width_m)
+    config = GripperConfig(
+        linkage=LinkageConfig.model_validate({"kind": kind, **keys}), open_width_m=open_width_m
+    )
     try:
         linkage = make_linkage(config)
     except ConfigError:

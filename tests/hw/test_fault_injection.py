@@ -32,7 +32,7 @@ class Two:
 
 
 def faults(unit: str, kind: str, at_s: float = 1.0, for_s: float = 1.0) -> Faults:
-    return Faults([FaultConfig(unit=unit, kind=kind, at_s=at_s, for_s=for_s)])
+    return Faults([FaultConfig.model_validate({"unit": unit, "kind": kind, "at_s": at_s, "for_s": for_s})])
 
 
 @pytest.mark.parametrize("unit", FAULTS)

@@ -46,7 +46,7 @@ class Source:
 
 
 def faults(unit: str, kind: str) -> Faults:
-    return Faults([FaultConfig(unit=unit, kind=kind, at_s=1.0, for_s=1.0)])
+    return Faults([FaultConfig.model_validate({"unit": unit, "kind": kind, "at_s": 1.0, "for_s": 1.0})])
 
 
 def frames_of(kind: str, clock: Clock) -> list[tuple[int, Frame]]:

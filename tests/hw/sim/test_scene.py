@@ -100,7 +100,7 @@ def test_seed_places_the_same_object_on_the_same_rig(own: int, seed: int, other:
 
 def test_object_seed_draws_texture_and_rig_seed_draws_table() -> None:
     def textures(**seeds: int) -> dict[str, bytes]:
-        return scene_mjcf(draw_scene("tube", 1, SimConfig(**seeds)), GripperConfig())[1]
+        return scene_mjcf(draw_scene("tube", 1, SimConfig.model_validate(seeds)), GripperConfig())[1]
 
     plain, other_object, other_rig = textures(), textures(object_seed=2), textures(rig_seed=2)
     assert plain["table.png"] == other_object["table.png"] != other_rig["table.png"]
@@ -142,9 +142,9 @@ def test_stiffness_fills_its_spread(spread: float) -> None:
     ],
 )
 def test_wider_spread_changes_nothing_else(change: dict[str, float], drawn: set[str]) -> None:
-    before, after = (asdict(draw_scene("tube", 3, SimConfig(**keys))) for keys in ({}, change))
+    before, after = (asdict(draw_scene("tube", 3, SimConfig.model_validate(keys))) for keys in ({}, change))
     assert {name for name in before if before[name] != after[name]} == drawn
-    fixed = SimConfig(object_seed=1, rig_seed=2, **change)
+    fixed = SimConfig.model_validate({"object_seed": 1, "rig_seed": 2, **change})
     first, again = (asdict(draw_scene("tube", seed, fixed)) for seed in (3, 4))
     assert {name for name in first if first[name] != again[name]} == {"offset_m", "yaw_deg"}
 
