@@ -41,7 +41,8 @@ class Section(BaseModel):
     @field_validator("*", mode="wrap")
     @classmethod
     def _checked(cls, value: Any, validate: Callable[[Any], Any]) -> Any:
-        valid = validate(value)
+        # Some keys of text may hold a path, such as vision.checkpoint.
+        valid = validate(str(value) if isinstance(value, Path) else value)
         if isinstance(value, bool) and isinstance(valid, int | float) and not isinstance(valid, bool):
             raise ValueError("it is a number, not true or false")  # noqa: TRY004  # as pydantic needs
         return Path(expanduser(valid)) if isinstance(valid, Path) else valid  # noqa: PTH111  # that one may raise

@@ -280,6 +280,16 @@ def test_overrides_may_be_a_mapping() -> None:
     )
 
 
+def test_a_key_of_text_takes_a_path() -> None:
+    keys = ("object", "servo.model", "servo.port", "vision.checkpoint", "calibration.object", "camera.device")
+    paths: dict[str, object] = {key: Path("/rig") / key for key in keys}
+    texts = load_config(None, [f"{key}={path}" for key, path in paths.items()])
+    assert load_config(None, paths) == texts
+    assert type(load_config(None, paths).vision.checkpoint) is str
+    sim = load_config(None, {"object": Path("mug.yaml")})
+    assert (sim.object, sim.sim.object) == ("mug", Path("mug.yaml"))
+
+
 @pytest.mark.timeout(600)  # mypy without a cache
 def test_a_type_checker_without_a_plugin_knows_the_defaults(tmp_path: Path) -> None:
     program = tmp_path / "program.py"

@@ -29,7 +29,7 @@ from gripper_force.plugins import require
 from gripper_force.profiles.apply import read_correction, read_profiles, with_bundle, with_object
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.schema import Tree
+from gripper_force.schema import Tree, as_path
 from gripper_force.types import Frame, LoadCellSample, ServoState
 from gripper_force.vision.model_files import read_model
 
@@ -94,8 +94,8 @@ def evaluate(
     include_contact_starts: bool = False,
     workers: int = 1,
     ray: str | None = None,
-    plot: Path | None = None,
-    out: Path | None = None,
+    plot: str | Path | None = None,
+    out: str | Path | None = None,
     progress: Progress = no_progress,
 ) -> Evaluation:
     """Compares a checkpoint's estimates with the load cell, over logs that training has not seen.
@@ -136,12 +136,14 @@ def evaluate(
         ConfigError: The profile can't be read, or belongs to another checkpoint or camera; or PyTorch is not installed.
     """
     require("torch", "evaluate")
-    if out is not None:
-        check_writable(out)
-    if plot is not None:
+    folder = None if out is None else as_path(out, "the folder of the summary", "name a folder")
+    figure = None if plot is None else as_path(plot, "the figure")
+    if folder is not None:
+        check_writable(folder)
+    if figure is not None:
         from gripper_force.jobs.report.plots import check_figure_path
 
-        check_figure_path(plot)
+        check_figure_path(figure)
     settings = _settings(config, checkpoint, profile)
     model = read_model(settings.vision.checkpoint)
     paths = find_logs(logs)
@@ -168,14 +170,14 @@ def evaluate(
         per_log={str(path): _log_errors(clip, estimates_n, lead_in) for path, clip, estimates_n in used},
         failed={str(paths[number]): str(error) for number, error in failed.items()},
     )
-    if out is not None:
+    if folder is not None:
         columns = [_columns(*log) for log in used]
-        write_summary(out, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
-    if plot is not None:
+        write_summary(folder, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
+    if figure is not None:
         from gripper_force.jobs.report.plots import draw_estimates
 
         title = f"{checkpoint}: MAE {result.mae_n:.3f} N on {len(clips)} logs"
-        draw_estimates(*_labelled(clips, forces_n, lead_in), title, plot)
+        draw_estimates(*_labelled(clips, forces_n, lead_in), title, figure)
     return result
 
 
@@ -191,7 +193,8 @@ def _settings(config: Config | None, checkpoint: str | Path, profile: str | None
 
 def _no_such_object(objects: Collection[str], paths: Sequence[Path]) -> DataError:
     there = sorted({config_from_text(LogReader(path).config, str(path)).object for path in paths})
-    return DataError(f"no log is of {', '.join(objects)}; there are {', '.join(there)}")
+    names = [objects] if isinstance(objects, str) else objects
+    return DataError(f"no log is of {', '.join(names)}; there are {', '.join(there)}")
 
 
 def _columns(path: Path, clip: Clip, forces_n: npt.NDArray[np.floating]) -> dict[str, npt.NDArray[Any]]:

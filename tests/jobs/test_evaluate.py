@@ -95,8 +95,20 @@ def test_logs_are_evaluated_like_their_clips(
         steps = [call.args[1] if len(call.args) > 1 else 1 for call in progress.call_args_list]
         assert sum(steps) == len(list(few_logs.iterdir()))
     (few_logs / "damaged.mcap").write_bytes(b"no log")
-    with pytest.raises(DataError, match="no log is of cup; there are disc"):
-        evaluate(few_logs, tiny_checkpoint, objects=["cup"])
+    for objects in (["cup"], "cup"):
+        with pytest.raises(DataError, match="no log is of cup; there are disc"):
+            evaluate(few_logs, tiny_checkpoint, objects=objects)
+
+
+def test_files_of_an_evaluation_may_be_named_by_text(
+    few_logs: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    figure, folder = tmp_path / "figures" / "errors.png", tmp_path / "summary"
+    evaluate(few_logs, tiny_checkpoint, plot=str(figure), out=str(folder))
+    assert figure.stat().st_size > 1000
+    assert (folder / "summary.json").exists()
+    with pytest.raises(ConfigError, match="the figure must be a path, not 5; name a file"):
+        evaluate(few_logs, tiny_checkpoint, plot=5)  # type: ignore[arg-type]
 
 
 def test_bfloat16_rounds_the_estimates_a_little(few_logs: Path) -> None:
