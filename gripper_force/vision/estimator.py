@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import MAX_COVERED, VisionConfig, config_from
-from gripper_force.errors import ConfigError, NonFiniteError, UnfamiliarFrameError
+from gripper_force.errors import ConfigError, DataError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.profiles.correction import Correction, load_correction
 from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.types import ForceEstimate, Gray
@@ -119,6 +119,7 @@ class ForceEstimator:
         if self._ood is not None:
             self._ood.reset()
         self._attention: Floats | None = None
+        self._shape: tuple[int, ...] | None = None  # None: no frame so far
 
     @property
     def reference(self) -> Gray | None:
@@ -135,7 +136,8 @@ class ForceEstimator:
             The estimate for this frame, or None while the reference is being collected.
 
         Raises:
-            DataError: The frame is not a gray image of bytes, or is implausible (see `FrameChecks`).
+            DataError: The frame is not a gray image of bytes, has another size than the frames before it, or is
+                implausible (see `FrameChecks`).
             UnfamiliarFrameError: The frame's out-of-distribution score exceeds the limit of the object profile or
                 of the checkpoint, or the view is covered or blurred (see `FrameChecks`).
             ConfigError: The region of interest reaches beyond the frame.
@@ -148,7 +150,13 @@ class ForceEstimator:
 
     def prepare(self, gray: Gray) -> list[Floats]:
         """Checks the next frame, and returns the network's inputs that are ready: the first half of `update`."""
-        self._frame_checks.check(small := downscale(gray, self._region, self._preprocess.size))
+        small = downscale(gray, self._region, self._preprocess.size)
+        # The region is in pixels, and the reference shows the view of another size.
+        if self._shape not in (None, gray.shape):
+            remedy = "keep the camera's resolution, or start a new stream"
+            raise DataError(f"the frame is {gray.shape}, but the stream began with {self._shape}; {remedy}")
+        self._frame_checks.check(small)
+        self._shape = gray.shape
         return self._normaliser.push(small)
 
     def finish(self, step: StepOutput) -> ForceEstimate:

@@ -22,7 +22,7 @@ from gripper_force.vision.estimator import ForceEstimator, open_estimator
 from gripper_force.vision.header import Header, NetworkConfig, OodModel, Residual
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
-from gripper_force.vision.preprocess import Preprocess, downscale
+from gripper_force.vision.preprocess import Preprocess, Region, downscale
 
 REGION = (10, 5, 40, 40)
 RESIDUALS = (Residual(force_n=-100, std_n=0), Residual(force_n=100, std_n=2))
@@ -132,6 +132,21 @@ def test_invalid_frame_or_region_is_refused(frames: np.ndarray) -> None:
         ForceEstimator(TorchEngine(ensemble("ssam")), (0, 0, 100, 100)).update(frames[0])
     with pytest.raises(DataError, match="gray"):
         ForceEstimator(TorchEngine(ensemble("ssam"))).update(frames)
+
+
+@pytest.mark.parametrize("region", [None, REGION])
+def test_a_frame_of_another_size_is_refused_until_a_reset(frames: np.ndarray, region: Region | None) -> None:
+    """A region in pixels shows another part of it, and without one the network sees a view that was stretched."""
+    estimator, undisturbed = (ForceEstimator(TorchEngine(ensemble("ssam")), region) for _ in range(2))
+    run(estimator, frames[:6])
+    for other in (frames[6, :48], np.ascontiguousarray(frames[6].T)):
+        with pytest.raises(
+            DataError, match=r"^the frame is \(\d+, \d+\), but the stream began with \(50, 60\); keep"
+        ):
+            estimator.update(other)
+    assert estimator.update(frames[6]) == run(undisturbed, frames[:7])[-1]
+    estimator.reset()
+    assert run(estimator, frames[:6, :48])[-1] is not None
 
 
 def limits_of(limit: float) -> tuple[OodLimit, ...]:
