@@ -11,6 +11,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from gripper_force.errors import ConfigError, DeviceError, GripperError
+from gripper_force.types import Frame, ServoState
 
 _METHODS: Final = {
     "servos": ("spec", "start", "read", "write", "stop", "close"),
@@ -19,6 +20,9 @@ _METHODS: Final = {
     "engines": ("step",),
 }
 """Methods of each interface, which a class is checked for before one is called."""
+
+_RETURNS: Final = {"read": ServoState, "newest": Frame | None, "drain": list | tuple, "counts": dict}
+"""Types of what methods return. Another one would fail later, in code that can't name the class."""
 
 EXTRAS: Final = {
     "torch": "train",
@@ -68,8 +72,8 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
         alternative: Another remedy if a package is not installed; see `importing`.
 
     Returns:
-        The class. One that is not built in is wrapped, and so are its objects: what their methods raise becomes one
-        sentence, a `DeviceError`, or a `ConfigError` of an engine.
+        The class. One that is not built in is wrapped, and so are its objects: what their methods raise, or return
+        by mistake, becomes one sentence, a `DeviceError`, or a `ConfigError` of an engine.
 
     Raises:
         ConfigError: The name is unknown, its module or a package that it needs is not installed, or what it
@@ -124,7 +128,7 @@ class _Plugin:
     def _call(self, function: Callable[..., Any], called: str, *arguments: Any, **named: Any) -> Any:
         try:
             with importing(called):  # a package may be imported only now
-                return function(*arguments, **named)
+                result = function(*arguments, **named)
         except GripperError:
             raise
         except Exception as error:
@@ -132,6 +136,10 @@ class _Plugin:
                 f"{called}() raised {type(error).__name__}: {' '.join(str(error).split())}; it is no part of "
                 "gripper-force: correct it, or tell its author"
             ) from error
+        if not isinstance(result, _RETURNS.get(called.rpartition(".")[2], object)):
+            found = f"{called}() returned {type(result).__name__}"
+            raise self._error_type(f"{found}; return what gripper_force.interfaces says")
+        return result
 
 
 def registered(group: str) -> dict[str, EntryPoint]:

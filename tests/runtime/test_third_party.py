@@ -1,6 +1,7 @@
 """Devices of other packages: what their code raises ends a run as any device's fault does."""
 
 import json
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -37,12 +38,15 @@ class Device:
         if self.fails == method and (method in ("__init__", "start", "settings") or self.calls > 9):
             raise ValueError(f"no {method}\\nhere")
 
+    def result(self, method, right):
+        return "nonsense" if self.fails == f"result of {method}" and self.calls > 9 else right
+
     def start(self):
         self.at("start")
 
     def counts(self):
         self.at("counts")
-        return {}
+        return self.result("counts", {})
 
     def close(self): ...
 
@@ -50,14 +54,15 @@ class Cell(Device):
     def drain(self):
         self.calls += 1
         self.at("drain")
-        return []
+        return self.result("drain", [])
 
 class Camera(Device):
     def newest(self):
         self.calls += 1
         self.at("newest")
         now_ns = self.clock.now_ns()
-        return Frame(now_ns, now_ns, self.calls, np.full((48, 64), self.calls % 250, np.uint8))
+        frame = Frame(now_ns, now_ns, self.calls, np.full((48, 64), self.calls % 250, np.uint8))
+        return self.result("newest", frame)
 
     def settings(self):
         self.at("settings")
@@ -76,7 +81,7 @@ class Servo(Device):
 
     def read(self):
         self.at("read")
-        return ServoState(self.clock(), 0.0, 0.0, 0.0, 12.0, 30.0, 0)
+        return self.result("read", ServoState(self.clock(), 0.0, 0.0, 0.0, 12.0, 30.0, 0))
 
     def write(self, command):
         self.calls += 1
@@ -93,6 +98,7 @@ REMEDY = "; it is no part of gripper-force: correct it, or tell its author$"
 def config(quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
     (tmp_path / "own_devices.py").write_text(DEVICES)
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_devices", raising=False)  # that of another test
     return load_config(None, [*quick, "log.report=false"])
 
 
@@ -113,6 +119,31 @@ def test_a_device_that_can_not_be_opened_is_named(
     assert not (tmp_path / "run.mcap").exists()
     *_, last = doctor.check_unit(with_own(config, unit, method), unit.replace("_", " "))
     assert (last.ok, "raised ValueError" in last.found) == (False, True)
+
+
+@pytest.mark.parametrize(
+    ("unit", "method"),
+    [
+        ("camera", "newest"),
+        ("camera", "counts"),
+        ("load_cell", "drain"),
+        ("load_cell", "counts"),
+        ("servo", "read"),
+    ],
+)
+def test_a_method_that_returns_something_else_is_named(
+    config: Config, tmp_path: Path, unit: str, method: str
+) -> None:
+    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}} if unit == "servo" else {}
+    clock = "realtime" if unit == "servo" else "lockstep"
+    own = with_own(config, unit, f"result of {method}", clock=clock, **none)
+    named = f"{UNITS[unit]}: {UNITS[unit].partition(':')[2]}"
+    sentence = (
+        rf"{unit}\.backend={named}\.{method}\(\) returned str; return what gripper_force\.interfaces says$"
+    )
+    with pytest.raises(DeviceError, match=sentence):
+        run_grasp(own, tmp_path / "run.mcap")
+    assert LogReader(tmp_path / "run.mcap").complete
 
 
 @pytest.mark.parametrize(
