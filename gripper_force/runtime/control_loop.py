@@ -128,7 +128,8 @@ class ControlLoop:
 
     def sleep(self, seconds: float) -> None:
         """Waits for a time on the run's clock, and runs the cycle where no thread does."""
-        seconds = checked_number(seconds, "a time")
+        if (seconds := checked_number(seconds, "a time")) < 0:
+            raise RequestError(f"a time of {seconds:g} s is negative; pass 0 or more")
         if self._background:
             self._ended.wait(seconds)
             self.live_session()

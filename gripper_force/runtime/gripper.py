@@ -240,7 +240,7 @@ class Gripper:
             seconds: Time on the run's clock.
 
         Raises:
-            RequestError: The gripper is closed, or the time is not a number of at most 1e9.
+            RequestError: The gripper is closed, or the time is not a number of 0 to 1e9.
             DeviceError: A device failed meanwhile.
         """
         self._loop.sleep(seconds)

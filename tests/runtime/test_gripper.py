@@ -238,6 +238,13 @@ def test_what_is_no_number_is_refused(simulated: Open, value: Any) -> None:
             call(value)
 
 
+def test_a_negative_time_is_refused(simulated: Open, real_time: Open) -> None:
+    for gripper in (simulated(), real_time()):
+        with pytest.raises(gf.RequestError, match=r"^a time of -1 s is negative; pass 0 or more$"):
+            gripper.sleep(-1)
+        gripper.sleep(0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
