@@ -228,11 +228,8 @@ class LogReader:
 
     def _describe_loss(self) -> str:
         self._recover = True
-        count = sum(1 for _ in self.records())
-        return (
-            f"{self.path} is cut short or damaged: {count} records ({self.duration_ns / NS_PER_S:.2f} s) "
-            f"can be recovered; {_REMEDY}"
-        )
+        whole = f"{sum(1 for _ in self.records())} records ({self.duration_ns / NS_PER_S:.2f} s)"
+        return f"{self.path} is cut short, damaged or not finished yet: {whole} can be recovered; {_REMEDY}"
 
 
 def _checked(chunk: Chunk) -> Chunk:

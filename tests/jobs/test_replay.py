@@ -169,7 +169,9 @@ def test_a_truncated_log_is_read_only_where_that_is_asked_for(fused_log: Path, t
     path = tmp_path / "cut.mcap"
     data = fused_log.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
-    with pytest.raises(LogError, match=r"is cut short or damaged: .* can be recovered; .* --recover"):
+    with pytest.raises(
+        LogError, match=r"is cut short, damaged or not finished yet: .* can be recovered; .* --recover"
+    ):
         replay(path)
     result = replay(path, recover=True)
     assert result.identical is True

@@ -201,7 +201,7 @@ def test_an_offset_that_is_no_number_is_refused(tmp_path: Path) -> None:
         writer.add_metadata("gripper_force", {UTC_NAME: "soon"})
         writer.add_attachment(0, 0, "config.yaml", "application/yaml", b"")
         writer.finish()
-    with pytest.raises(LogError, match="cut short or damaged"):
+    with pytest.raises(LogError, match="cut short, damaged or not finished yet"):
         LogReader(path)
 
 
@@ -262,7 +262,9 @@ def test_a_log_cut_at_any_byte_is_refused_in_one_sentence_and_every_whole_chunk_
     near = {size for end in ends for size in range(max(end - 80, 0), min(end + 80, len(data)))}
     for size in sorted(near | set(range(0, len(data), 7))):
         cut.write_bytes(data[:size])
-        with pytest.raises(LogError, match=r"cut\.mcap is cut short or damaged: \d+ records .*--recover"):
+        with pytest.raises(
+            LogError, match=r"cut\.mcap is cut short, damaged or not finished yet: \d+ records .*--recover"
+        ):
             LogReader(cut)
         try:
             log = LogReader(cut, recover=True)
@@ -355,7 +357,7 @@ def test_damage_outside_of_the_chunks_is_found(tmp_path: Path) -> None:
         content = bytearray(whole)
         content[position] ^= 1
         path.write_bytes(content)
-        with pytest.raises(LogError, match="is cut short or damaged"):
+        with pytest.raises(LogError, match="is cut short, damaged or not finished yet"):
             LogReader(path)
 
 
