@@ -106,8 +106,8 @@ def open_engine(
     """
     if precision not in get_args(Precision):
         raise ConfigError(f"unknown vision.precision {precision!r}; use {' or '.join(get_args(Precision))}")
-    if threads is not None and threads < 1:
-        raise ConfigError(f"vision.threads {threads} is not positive; use at least 1, or None")
+    if threads is not None and not (isinstance(threads, int | np.integer) and threads > 0):
+        raise ConfigError(f"vision.threads {threads!r} is not a whole number from 1 on; name one, or None")
     if precision != "float32" and engine in ENGINES and engine != "openvino":
         raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
     other = "" if engine == "onnxruntime" else ", or set vision.engine=onnxruntime"

@@ -183,6 +183,11 @@ def test_incompatible_engine_file_and_precision_are_refused(ensemble: Path) -> N
         open_engine(model, "torch", "bfloat16")
     with pytest.raises(ConfigError, match=r"unknown vision\.precision 'int8'; use float32 or bfloat16"):
         open_engine(model, "torch", "int8")  # type: ignore[arg-type]
+    for threads in (0, 1.5, "2"):
+        with pytest.raises(
+            ConfigError, match=rf"vision\.threads {threads!r} is not a whole number from 1 on"
+        ):
+            open_engine(model, "torch", threads=threads)  # type: ignore[arg-type]
     needs("openvino")
     file = read_model(exported_file(model, ".xml"))
     for name in ("torch", "onnxruntime"):
