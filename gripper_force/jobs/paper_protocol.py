@@ -10,6 +10,7 @@ of its own.
 """
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -18,6 +19,7 @@ import numpy as np
 
 from gripper_force.config import HARD_FORCE_LIMIT_N, Config, config_from, config_from_text, dump_config
 from gripper_force.errors import ConfigError, SimulationError
+from gripper_force.files import unfinished
 from gripper_force.interfaces import Camera
 from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.recording.record import FREE_N, check_same
@@ -192,20 +194,19 @@ def make_set(task: SetPlan, out: Path, config: Tree) -> list[Path]:
     """
     paths = {lux: out / name for lux, name in zip(task.lux, task.names, strict=True)}
     paths = {lux: path for lux, path in paths.items() if not path.exists()}
-    unfinished = {lux: path.with_name(f".{path.name}.part") for lux, path in paths.items()}
-    for path in unfinished.values():
-        path.unlink(missing_ok=True)
-    for draw in range(_MAX_DRAWS):
-        seed = task.seed + draw * _SEED_STEP
-        try:
-            _run_set(config_from(config, "simulate"), task, seed, unfinished)
-            break
-        except SimulationError:
-            for path in unfinished.values():
-                path.unlink(missing_ok=True)
-            if draw == _MAX_DRAWS - 1:
-                raise
-    return [unfinished[lux].rename(path) for lux, path in paths.items()]
+    with ExitStack() as stack:
+        parts = {lux: stack.enter_context(unfinished(path)) for lux, path in paths.items()}
+        for draw in range(_MAX_DRAWS):
+            seed = task.seed + draw * _SEED_STEP
+            try:
+                _run_set(config_from(config, "simulate"), task, seed, parts)
+                break
+            except SimulationError:
+                for part in parts.values():
+                    part.unlink(missing_ok=True)
+                if draw == _MAX_DRAWS - 1:
+                    raise
+    return list(paths.values())
 
 
 def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) -> None:

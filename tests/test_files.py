@@ -1,0 +1,61 @@
+"""Files that appear once they are complete: what an interruption and a second process leave."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gripper_force.errors import DataError
+from gripper_force.files import unfinished
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from gripper_force.files import unfinished
+with unfinished(Path(sys.argv[1])) as part:
+    part.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_appears_once_it_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.mcap"
+    with unfinished(path) as part:
+        part.write_text("whole")
+        assert not path.exists()
+    assert (names(path.parent), path.read_text()) == (["a.mcap"], "whole")
+
+
+def test_an_error_leaves_the_old_file_and_the_unfinished_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_text("old")
+    with pytest.raises(OSError, match="full"), unfinished(path) as part:
+        part.write_text("half")
+        raise OSError("full")
+    assert (names(tmp_path), path.read_text()) == ([".a.mcap.part", "a.mcap"], "old")
+
+
+def test_a_second_writer_is_refused_and_harms_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with unfinished(path) as part:
+        part.write_text("first")
+        with pytest.raises(DataError, match=r"another process is writing .*a\.mcap; wait"), unfinished(path):
+            pass
+        with unfinished(tmp_path / "b.mcap") as other:  # another file of the folder is free
+            other.write_text("other")
+    assert (names(tmp_path), path.read_text()) == (["a.mcap", "b.mcap"], "first")
+
+
+def test_a_killed_writer_locks_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    subprocess.run([sys.executable, "-c", KILLED, path], check=False)
+    assert names(tmp_path) == [".a.mcap.lock", ".a.mcap.part"]
+    with unfinished(path) as part:
+        assert not part.exists()
+        part.write_text("whole")
+    assert names(tmp_path) == ["a.mcap"]
