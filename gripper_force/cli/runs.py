@@ -138,7 +138,7 @@ def _grasp_once(settings: "Config", view: str | None, as_json: bool) -> None:
     except KeyboardInterrupt:
         if log.exists():
             console.err.print(
-                f"the run until then is in {log}: gripper-force replay {log}",
+                f"the run until then is in {log}: {console.command('replay', log)}",
                 soft_wrap=True,
                 markup=False,
             )
@@ -297,7 +297,9 @@ def replay(
     if pages:
         console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
     elif len(replays.results) == 1:
-        console.next_step("replay", *logs, *_changes(checkpoint, set_), "--report")
+        console.next_step(
+            "replay", *logs, *_changes(checkpoint, set_), *(["--recover"] if recover else ()), "--report"
+        )
     console.end_with_failures(replays.failed, len(paths), unreported)
 
 

@@ -104,4 +104,5 @@ def write_all(files: dict[Path, bytes]) -> None:
                 stack.enter_context(unfinished(path)).write_bytes(data)
     except OSError as error:
         names = " and ".join(map(str, files))
-        raise ConfigError(f"can't write {names}: {error.strerror}, {error.filename}") from error
+        where = "" if error.filename is None else f", {error.filename}"  # a full disk names no file
+        raise ConfigError(f"can't write {names}: {error.strerror}{where}") from error

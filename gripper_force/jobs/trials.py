@@ -3,6 +3,7 @@
 import time
 from collections.abc import Generator, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Final, TypedDict
 
 import numpy as np
@@ -112,7 +113,7 @@ def trials(
         if device and result["result"] == Outcome.FAULT:
             raise DeviceError(
                 f"trial {number} of {count} ended with a fault, so no further one was run; look at the gripper, "
-                f"and at the fault with: gripper-force replay {result['log']} --report"
+                f"and at the fault with: gripper-force replay {quote(result['log'])} --report"
             )
 
 

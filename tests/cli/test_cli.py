@@ -524,7 +524,9 @@ def test_a_truncated_log_is_refused_and_recovered_on_request(
     assert done.code == 2
     assert "can be recovered; read what is whole with `gripper-force replay LOG --recover`" in done.err
     assert "leave this log out elsewhere" in run("evaluate", path, "--checkpoint", "small").err
-    assert run("replay", path, "--recover", "--json").json()["frames"] > 100
+    recovered = run("replay", path, "--recover", "--json")
+    assert recovered.json()["frames"] > 100
+    assert recovered.err.splitlines()[-1] == f"next: gripper-force replay {path} --recover --report"
 
 
 def test_a_file_that_is_no_checkpoint_is_named(
@@ -566,6 +568,10 @@ def test_a_folder_is_replayed(run: Run, fused_log: Path, tmp_path: Path) -> None
     table = run("replay", tmp_path / "a.mcap", tmp_path / "b.mcap", "--jobs", 1)
     assert "a.mcap" in table.out
     assert "stapler" in table.out
+    long = (tmp_path / "b.mcap").rename(tmp_path / f"{'20261128-094116-' * 4}sponge.mcap")
+    table = run("replay", tmp_path, "--jobs", 1)
+    names = "".join(line.split(" ")[1] for line in table.out.splitlines()[1:7])
+    assert long.name in names  # an output of 80 columns cuts nothing off
 
 
 def test_two_settings_are_compared(run: Run, fused_log: Path, tmp_path: Path, tiny_checkpoint: Path) -> None:
@@ -595,10 +601,11 @@ def interrupt(arguments: list[str], folder: Path) -> tuple[int, str]:
 
 
 def test_an_interrupted_grasp_says_where_its_log_is(sets: list[str], tmp_path: Path) -> None:
-    code, said = interrupt(["grasp", *sets, "--set", "control.hold_s=600"], tmp_path)
+    more = ["--set", "control.hold_s=600", "--set", f"log.directory={tmp_path}/my runs"]
+    code, said = interrupt(["grasp", *sets, *more], tmp_path)
     assert (code, "Traceback" in said) == (130, False)
     (log,) = tmp_path.rglob("*.mcap")
-    assert f"gripper-force replay {log}" in said
+    assert f"gripper-force replay '{log}'" in said  # as a shell takes it
     assert LogReader(log).duration_ns > 0
 
 

@@ -23,6 +23,13 @@ _REFUSED = (
 )
 
 
+def _table(*columns: str | Column) -> Table:
+    """Returns a table that continues a long cell in the next line: a narrow output must not lose digits or names."""
+    return Table(
+        *(Column(one, overflow="fold") if isinstance(one, str) else one for one in columns), box=None
+    )
+
+
 def grasp_table(r: "GraspSummary") -> None:
     """Prints the figures of a grasp."""
     share = ""
@@ -74,7 +81,7 @@ def trials_table(
 ) -> None:
     """Prints the figures of each trial and over all trials."""
     names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %", "gain")
-    table = Table(*names, Column("result", no_wrap=True), box=None)
+    table = _table(*names, Column("result", no_wrap=True))
     for t in trials:
         error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
         table.add_row(
@@ -101,7 +108,7 @@ def trials_table(
         out.print("No load cell: force errors, overshoot and peaks can't be measured.")
         return
     pairs(plain)
-    table = Table("MAE over the run, N", "vision", "current", "fused", "floor", box=None)
+    table = _table("MAE over the run, N", "vision", "current", "fused", "floor")
     for name, e in summary["estimate_mae_n"].items():
         table.add_row(escape(name), *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
     out.print(table)
@@ -112,7 +119,7 @@ def trials_table(
 def errors_table(r: "Evaluation") -> None:
     """Prints errors of estimates: over all frames, by object and by force."""
     pairs({key: getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
-    table = Table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames", box=None)
+    table = _table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames")
     for name, o in r.per_object.items():
         figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
         table.add_row(escape(name), *(number(value) for value in figures), str(o.frames))
@@ -121,7 +128,7 @@ def errors_table(r: "Evaluation") -> None:
 
 
 def _bins_table(bins: "list[ForceBin]") -> None:
-    table = Table("force N", "MAE N", "bias N", "frames", box=None)
+    table = _table("force N", "MAE N", "bias N", "frames")
     for b in bins:
         span = f"{b.from_n:.0f}-{b.to_n:.0f}"
         table.add_row(span, number(b.mae_n), number(b.bias_n), str(b.frames))
@@ -143,7 +150,7 @@ def replay_table(r: "ReplayResult", report: str | None = None) -> None:
         return
     if r.refused:
         out.print(_REFUSED.format(r.refused, r.seen), soft_wrap=True)
-    table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
+    table = _table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples")
     for name, s in r.sources.items():
         figures = (s.mae_n, s.rmse_n, s.bias_n, s.contact_mae_n)
         lag = number(None if s.lag_s is None else 1e3 * s.lag_s, digits=0)
@@ -157,7 +164,7 @@ def replays_table(
 ) -> None:
     """Prints the result of several replays: one row for each log, and the errors over all of them."""
     marks = {True: "yes", False: "no", None: "-"}
-    table = Table("log", "object", "identical", "vision N", "current N", "fused N", box=None)
+    table = _table("log", "object", "identical", "vision N", "current N", "fused N")
     for r in results:
         errors = (
             r.sources[name].mae_n if name in r.sources else None for name in ("visual", "current", "fused")
@@ -174,7 +181,7 @@ def replays_table(
     pairs({"logs": str(summary.logs), "identical": str(summary.identical)})
     if summary.refused:
         out.print(_REFUSED.format(summary.refused, summary.seen), soft_wrap=True)
-    table = Table("object", "source", "MAE N", "RMSE N", "bias N", "samples", box=None)
+    table = _table("object", "source", "MAE N", "RMSE N", "bias N", "samples")
     for name, sources in {"all": summary.sources, **summary.per_object}.items():
         for source, e in sources.items():
             table.add_row(
@@ -189,15 +196,8 @@ def replays_table(
 
 def differences_table(first: str, second: str, differences: "dict[str, PairedDifference]") -> None:
     """Prints how the errors of two replays differ."""
-    table = Table(
-        "source",
-        "logs",
-        f"{escape(first)}: MAE N",
-        f"{escape(second)}: MAE N",
-        "difference N",
-        "95 % interval",
-        box=None,
-    )
+    sides = (f"{escape(name)}: MAE N" for name in (first, second))
+    table = _table("source", "logs", *sides, "difference N", "95 % interval")
     for name, d in differences.items():
         interval = "-" if d.low_n is None or d.high_n is None else f"{d.low_n:+.3f} to {d.high_n:+.3f}"
         row = (number(d.first_n), number(d.second_n), f"{d.difference_n:+.3f}", interval)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Any, Final, Protocol
 
 from gripper_force import plugins
@@ -171,6 +172,8 @@ def beside_run(
             yield
             process.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:
-            tell(f"the viewer is behind and was ended; show the whole run with: gripper-force view {path}")
+            tell(
+                f"the viewer is behind and was ended; show the whole run with: gripper-force view {quote(str(path))}"
+            )
         finally:
             process.terminate()
