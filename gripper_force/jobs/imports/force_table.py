@@ -51,7 +51,11 @@ def read_forces(path: Path) -> ForceTable:
             columns = ("frame", "t_s", "force_n")
             missing = [column for column in columns if column not in (reader.fieldnames or [])]
             if missing:
-                raise DataError(f"{path} lacks the column {missing[0]!r}; add frame, t_s and force_n")
+                found = ",".join(reader.fieldnames or [])  # shows another separator, or other letters
+                raise DataError(
+                    f"{path} lacks the column {missing[0]!r}: its first line is {found[:80]!r}; name columns frame, "
+                    "t_s and force_n, separated by commas"
+                )
             rows = [
                 [_number(path, reader.line_num, column, row[column]) for column in columns] for row in reader
             ]

@@ -165,7 +165,7 @@ def import_video(
 
 def object_of(name: str) -> str:
     """Returns the object in a recording's name: ``2023-12-16_foam_brick_2`` is a ``foam_brick``."""
-    found = re.fullmatch(r"(?:\d{4}-\d{2}-\d{2}_)?(.+?)(?:_\d+)?", name)
+    found = re.fullmatch(r"(?:\d{4}-?\d{2}-?\d{2}_)?(.+?)(?:_\d+)?", name)
     return found[1] if found else name
 
 

@@ -15,6 +15,10 @@ GRIP_N = np.interp(np.arange(60), [0, 15, 30, 45, 50, 60], [0, 0, 20, 20, 0, 0])
     [
         ("", "lacks the column 'frame'"),
         ("frame,t_s\n0,0\n", "lacks the column 'force_n'"),
+        (
+            "frame;t_s;force_n\n0;0,0;1\n",
+            "its first line is 'frame;t_s;force_n'; name columns frame, t_s and force_n, ",
+        ),
         ("frame,t_s,force_n\n", "holds no rows"),
         ("frame,t_s,force_n\n0,0,1\n1,0.03,oops\n", "line 3: force_n is 'oops' and not a finite number"),
         ("frame,t_s,force_n\n0,0,nan\n", "line 2: force_n is 'nan' and not a finite number"),

@@ -138,6 +138,7 @@ def test_pairs_of_files_and_object_name(folder: Path, tmp_path: Path) -> None:
         ("foam_brick_12", "foam_brick"),
         ("sponge", "sponge"),
         ("2023-12-16_egg", "egg"),
+        ("20231216_egg_2", "egg"),
         ("7", "7"),
     ],
 )
