@@ -289,14 +289,15 @@ def replay(
     if out is not None:
         title = f"Replay of {len(replays.results)} logs"
         write_summary(out, title, replay_tables({"": replays}), replays.columns)
-    _show_replays(replays, pages, as_json, alone=len(paths) == 1)
+    lacking = {log: str(error) for log, error in unreported.items()}
+    _show_replays(replays, pages, lacking, as_json, alone=len(paths) == 1)
     if out is not None:
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     if set_ or checkpoint:
         console.err.print(_OPEN_LOOP, soft_wrap=True)
     if pages:
         console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
-    elif len(replays.results) == 1:
+    elif len(replays.results) == 1 and not unreported:
         console.next_step(
             "replay", *logs, *_changes(checkpoint, set_), *(["--recover"] if recover else ()), "--report"
         )
@@ -322,13 +323,17 @@ def _write_reports(
     return pages, {str(logs[number]): error for number, error in problems.items()}
 
 
-def _show_replays(replays: "Replays", pages: list[str], as_json: bool, *, alone: bool) -> None:
+def _show_replays(
+    replays: "Replays", pages: list[str], unreported: dict[str, str], as_json: bool, *, alone: bool
+) -> None:
     """Shows one result, or with several logs the results and the errors over all."""
     from gripper_force.jobs.replay.comparison import summarise_replays
 
     results = replays.results
+    failures = {"unreported": unreported} if unreported else {}
     if alone:
-        shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
+        report = {"report": pages[0]} if pages else {}
+        shown = {**console.jsonable(results[0]), **report, **failures}
         console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
         return
     overall = summarise_replays(results)
@@ -338,6 +343,7 @@ def _show_replays(replays: "Replays", pages: list[str], as_json: bool, *, alone:
         "summary": overall,
         **({"failed": unread} if unread else {}),
         **({"reports": pages} if pages else {}),
+        **failures,
     }
     console.show(printed, as_json, lambda _: replays_table(results, overall, pages))
 

@@ -360,6 +360,7 @@ def test_an_unforeseen_exception_at_one_log_does_not_stop_the_others(
     assert printed["reports"] == [str(fused_log)]
     assert len(printed["logs"]) == (1 if stage == "replay" else 2)
     assert list(printed.get("failed", [])) == ([str(bad)] if stage == "replay" else [])
+    assert list(printed.get("unreported", [])) == ([str(bad)] if stage == "report" else [])
 
 
 def test_another_network_in_batches_gives_the_estimates_of_a_run(fused_log: Path) -> None:
