@@ -11,7 +11,6 @@ from operator import attrgetter
 from typing import Any, Final
 
 from gripper_force.errors import ConfigError, DeviceError, GripperError
-from gripper_force.types import Frame, ServoState
 
 _METHODS: Final = {
     "servos": ("spec", "start", "read", "write", "stop", "close"),
@@ -21,8 +20,9 @@ _METHODS: Final = {
 }
 """Methods of each interface, which a class is checked for before one is called."""
 
-_RETURNS: Final = {"read": ServoState, "newest": Frame | None, "drain": list | tuple, "counts": dict}
-"""Types of what methods return. Another one would fail later, in code that can't name the class."""
+_RETURNS: Final = {"read": "ServoState", "newest": "Frame NoneType", "drain": "list tuple", "counts": "dict"}
+"""Names of the types that methods return: importing these takes time. Another type would fail later, in code that can't
+name the class."""
 
 EXTRAS: Final = {
     "torch": "train",
@@ -136,7 +136,8 @@ class _Plugin:
                 f"{called}() raised {type(error).__name__}: {' '.join(str(error).split())}; it is no part of "
                 "gripper-force: correct it, or tell its author"
             ) from error
-        if not isinstance(result, _RETURNS.get(called.rpartition(".")[2], object)):
+        expected = _RETURNS.get(called.rpartition(".")[2], "object").split()
+        if not any(base.__name__ in expected for base in type(result).__mro__):
             found = f"{called}() returned {type(result).__name__}"
             raise self._error_type(f"{found}; return what gripper_force.interfaces says")
         return result
