@@ -305,8 +305,8 @@ class VisionConfig(Section):
         "(shipped); none; or auto: the cheapest shipped one within `budget`",
     )
     engine: str = Field(
-        "torch",
-        description="torch, openvino, onnxruntime; auto: the fastest one installed, with the best number of "
+        "onnxruntime",
+        description="onnxruntime, openvino, torch; auto: the fastest one installed, with the best number of "
         f"threads, measured once per machine; {_BACKEND} (gripper_force.engines)",
     )
     precision: Literal["float32", "bfloat16"] = Field(

@@ -25,12 +25,12 @@ _RETURNS: Final = {"read": "ServoState", "newest": "Frame NoneType", "drain": "l
 name the class."""
 
 EXTRAS: Final = {
-    "torch": "train",
+    **dict.fromkeys(("torch", "onnx", "onnxscript"), "train"),
     "mujoco": "sim",
     "depthai": "oak",
     "scipy": "calibrate",
     "matplotlib": "report",
-    **dict.fromkeys(("openvino", "nncf", "onnx", "onnxscript"), "engines"),
+    **dict.fromkeys(("openvino", "nncf"), "engines"),
     **dict.fromkeys(("rerun", "foxglove"), "view"),
     "lerobot": "lerobot",
     "pyarrow": "parquet",

@@ -67,7 +67,7 @@ class ForceEstimator:
         region: Region | None = None,
         max_covered: float = MAX_COVERED,
         profile: str | Path | None = None,
-        engine: str = "torch",
+        engine: str = "onnxruntime",
         precision: Precision = "float32",
         threads: int | None = None,
     ) -> Self:
@@ -95,7 +95,7 @@ class ForceEstimator:
                 it for jaws that fill more of the view.
             profile: Object profile: a name such as ``sponge``, or the path of a YAML file. Its network must
                 be this one; its camera settings are not checked.
-            engine: ``torch``, ``openvino``, ``onnxruntime``, or an engine of another package: the name of an
+            engine: ``onnxruntime``, ``openvino``, ``torch``, or an engine of another package: the name of an
                 entry point in the group ``gripper_force.engines``, or ``package.module:Class``.
             precision: Precision of the arithmetic. Of the built-in engines only OpenVINO has ``bfloat16``.
             threads: CPU threads. With PyTorch this sets the threads of the whole process. None leaves that

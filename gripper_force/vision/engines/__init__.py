@@ -86,7 +86,7 @@ class Engine(ABC):
 
 
 def open_engine(
-    model: Model, engine: str = "torch", precision: Precision = "float32", threads: int | None = 1
+    model: Model, engine: str = "onnxruntime", precision: Precision = "float32", threads: int | None = 1
 ) -> Engine:
     """Loads a model into an engine and runs it once, so that a run's first step is as fast as the others.
 
