@@ -49,9 +49,9 @@ docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo open build/site/index.html
 
-# sdist and wheel in dist/, with the networks that a robot without PyTorch runs
+# sdist and wheel in dist/
 wheel: setup-dev
-	$(BIN)/python scripts/build-wheel
+	$(BIN)/python -m hatchling build
 
 format: setup-dev
 	$(BIN)/ruff check --fix .

@@ -21,8 +21,6 @@ from gripper_force.cli.configuration import shipped_files
 from gripper_force.plugins import EXTRAS
 from gripper_force.runtime import backends
 from gripper_force.vision.engines import ENGINES
-from gripper_force.vision.export import export
-from gripper_force.vision.model_files import exported_name, read_model
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -139,14 +137,6 @@ def test_a_grasp_on_motor_current_needs_the_core_only(tmp_path: Path) -> None:
     assert Path(tmp_path, result["log"]).is_file()
 
 
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small network, as another machine exports it."""
-    path = tmp_path_factory.mktemp("exported") / "small.onnx"
-    export(read_model("small"), path)
-    return path
-
-
 VISION = """
 from pathlib import Path
 from gripper_force.config import Config, dump_config
@@ -163,10 +153,9 @@ with LogWriter(Path("frames.mcap"), config=dump_config(Config()), metadata={}) a
 """
 
 
-def test_a_grasp_with_vision_needs_the_core_and_an_exported_network(tmp_path: Path, exported: Path) -> None:
-    network = ("vision.engine=onnxruntime", f"vision.checkpoint={exported}")
+def test_a_grasp_with_vision_needs_the_core_only(tmp_path: Path) -> None:
     camera = ("camera.backend=playback", "camera.path=frames.mcap", "control.feedback=fused")
-    keys = settings(*REAL, *PATIENT, *network, *camera, "control.hold_s=0.3")
+    keys = settings(*REAL, *PATIENT, "vision.checkpoint=small", *camera, "control.hold_s=0.3")
     done = without_extras("grasp", "--target-n=3", "--json", *keys, cwd=tmp_path, code=VISION + SERVO + MAIN)
     assert done.returncode in (0, 1), done.stderr  # noise is no object, so the outcome does not count
     result = json.loads(done.stdout)
@@ -185,7 +174,10 @@ LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}
         (["grasp", *settings("log.report=false")], "servo.port=virtual:rig needs mujoco", "sim"),
         (["grasp", "--trials=2"], "log.report=true needs matplotlib", "report"),
         (
-            ["grasp", *settings(*REAL, "camera.backend=playback", "camera.path=frames.mcap")],
+            [
+                "grasp",
+                *settings(*REAL, "camera.backend=playback", "camera.path=frames.mcap", "vision.engine=torch"),
+            ],
             "vision.engine=torch needs torch",
             "train",
         ),
@@ -241,7 +233,7 @@ def test_a_missing_package_is_named_with_its_extra(
 def test_a_library_user_gets_a_typed_error(tmp_path: Path) -> None:
     code = """
 import gripper_force as gf
-for call in (lambda: gf.teach, lambda: gf.open_gripper().__enter__(), lambda: gf.ForceEstimator.load()):
+for call in (lambda: gf.teach, lambda: gf.open_gripper().__enter__(), lambda: gf.ForceEstimator.load(engine="torch")):
     try:
         call()
     except gf.ConfigError as error:
@@ -256,8 +248,8 @@ for call in (lambda: gf.teach, lambda: gf.open_gripper().__enter__(), lambda: gf
     ], done.stderr
 
 
-def test_a_checkpoint_without_export_says_what_to_do(tmp_path: Path) -> None:
-    code = "import gripper_force as gf\ngf.ForceEstimator.load('small', engine='onnxruntime')"
+def test_a_checkpoint_without_export_says_what_to_do(tmp_path: Path, tiny_checkpoint: Path) -> None:
+    code = f"import gripper_force as gf\ngf.ForceEstimator.load({str(tiny_checkpoint)!r})"
     done = without_extras(cwd=tmp_path, code=code)
     assert "needs torch, which is not installed" in done.stderr
     assert (
@@ -426,17 +418,11 @@ def test_messages_name_no_file_of_the_repository() -> None:
                 assert "://" in node.value or not paths.search(node.value), f"{name}: {node.value}"
 
 
-def test_a_robot_runs_a_shipped_network_that_the_wheel_brings(
-    wheel: Path, tmp_path: Path, exported: Path
-) -> None:
-    """`scripts/build-wheel` puts the exports into the package; here one of them is put there."""
-    folder = wheel / "gripper_force/vision/exported"
-    folder.mkdir(exist_ok=True)
-    (folder / exported_name(read_model("small"), ".onnx")).write_bytes(exported.read_bytes())
+def test_a_robot_runs_a_shipped_network_that_the_wheel_brings(wheel: Path, tmp_path: Path) -> None:
     code = """
 import gripper_force as gf
 import numpy as np
-estimator = gf.ForceEstimator.load("small", engine="onnxruntime")
+estimator = gf.ForceEstimator.load("small")
 frame = np.random.default_rng(0).integers(0, 256, (128, 128), np.uint8)
 print(gf.__file__, [estimator.update(frame) for _ in range(8)][-1])
 """

@@ -111,7 +111,23 @@ def _save_onnx(model: Model, path: Path) -> None:
     assert program is not None
     for name, text in _metadata(model).items():
         program.model.metadata_props[f"{KEY}.{name}"] = text
-    program.save(str(path))
+    network = program.model_proto
+    _halve_weights(network.graph)
+    path.write_bytes(network.SerializeToString())
+
+
+def _halve_weights(graph: Any) -> None:
+    """Stores the weights of an ONNX graph in float16 where that is exact. Engines widen them once, as they load."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    for tensor in list(graph.initializer):
+        weights = numpy_helper.to_array(tensor)
+        with np.errstate(over="ignore"):
+            half = weights.astype(np.float16)
+        if weights.dtype == np.float32 and np.array_equal(half, weights):
+            name = tensor.name
+            tensor.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
+            graph.node.insert(0, helper.make_node("Cast", [tensor.name], [name], to=TensorProto.FLOAT))
 
 
 def openvino_network(model: Model) -> Any:

@@ -27,7 +27,7 @@ WEIGHTS: Final = "weights"
 """Name in an OpenVINO file's metadata of the SHA-256 of its weights, which are in a file of their own."""
 
 SHIPPED_EXPORTS: Final = Path(__file__).with_name("exported")
-"""Folder of the shipped checkpoints as ONNX files. It is in wheels, which `scripts/build-wheel` makes."""
+"""Folder of the shipped checkpoints as ONNX files, which `scripts/export-shipped` makes."""
 
 
 def read_model(source: str | Path) -> Model:
@@ -56,7 +56,7 @@ def read_model(source: str | Path) -> Model:
 def exported_file(model: Model, suffix: str) -> Path:
     """Returns the file of a model that an engine runs.
 
-    This is the model's own file; or, for a checkpoint, an export that a wheel brings for a shipped one, or one in
+    This is the model's own file; or, for a checkpoint, the export that comes with a shipped one, or one in
     the cache folder, made at the first use.
 
     Args:

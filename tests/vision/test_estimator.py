@@ -296,7 +296,9 @@ def test_pytorchs_threads_are_set_unless_switched_off(tiny_checkpoint: Path) -> 
     try:
         torch.set_num_threads(3)
         ForceEstimator.load(tiny_checkpoint)
-        open_estimator(read_model(tiny_checkpoint), VisionConfig(engine="torch", threads=2), set_threads=False)
+        open_estimator(
+            read_model(tiny_checkpoint), VisionConfig(engine="torch", threads=2), set_threads=False
+        )
         assert torch.get_num_threads() == 3
         open_estimator(read_model(tiny_checkpoint), VisionConfig(engine="torch", threads=2))
         assert torch.get_num_threads() == 2

@@ -5,6 +5,9 @@ import pytest
 from gripper_force.config import load_config
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.simulate import plan, simulate
+from gripper_force.vision.export import export_errors
+from gripper_force.vision.header import SHIPPED
+from gripper_force.vision.model_files import SHIPPED_EXPORTS, exported_name, read_model
 
 
 @pytest.mark.parametrize("moving", ["false", "true"])
@@ -14,3 +17,12 @@ def test_shipped_network_tolerates_a_moving_background(moving: str, tmp_path: Pa
     result = evaluate(tmp_path)
     assert result.mae_n < 0.4
     assert max(errors.mae_n for errors in result.per_object.values()) < 0.7
+
+
+def test_the_onnx_files_are_exports_of_the_checkpoints() -> None:
+    models = {exported_name(model, ".onnx"): model for model in map(read_model, SHIPPED)}
+    assert {path.name for path in SHIPPED_EXPORTS.iterdir()} == set(models)
+    for name, model in models.items():
+        exported = read_model(SHIPPED_EXPORTS / name)
+        assert (exported.digest, exported.header) == (model.digest, model.header)
+        assert export_errors(model, SHIPPED_EXPORTS / name)["largest_n"] < 1e-3
