@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -99,10 +100,10 @@ def replay_frames(
 
 def _may_batch(reader: LogReader, resolved: ResolvedConfig) -> bool:
     """Returns True if no estimate can equal a logged one bit for bit: then batches, which round otherwise, do."""
-    model, vision = resolved.model, resolved.config.vision
-    if model is None or vision.engine != "torch":
+    model, engine = resolved.model, resolved.config.vision.engine
+    if model is None or model.path.suffix != ".safetensors" or engine not in ("onnxruntime", "torch"):
         return False
-    return reader.metadata.get("checkpoint", "") != model.digest
+    return reader.metadata.get("checkpoint", "") != model.digest and find_spec("torch") is not None
 
 
 class Replays(NamedTuple):

@@ -110,9 +110,8 @@ def open_engine(
         raise ConfigError(f"vision.threads {threads!r} is not a whole number from 1 on; name one, or None")
     if precision != "float32" and engine in ENGINES and engine != "openvino":
         raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
-    other = "" if engine == "onnxruntime" else ", or set vision.engine=onnxruntime"
-    engine_class = load_class("engines", ENGINES, engine, "vision.engine", other)
-    opened: Engine = engine_class(model, precision, threads)
+    other = ", or set vision.engine=onnxruntime"
+    opened: Engine = load_class("engines", ENGINES, engine, "vision.engine", other)(model, precision, threads)
     opened.step(np.zeros((model.header.preprocess.size,) * 2, np.float32))
     opened.reset()
     return opened
