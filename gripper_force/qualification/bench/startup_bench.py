@@ -121,7 +121,7 @@ STARTUP_CASES: Final = (
     StartupCase("simulated, camera, no network", _SIMULATED | {"cv2"}, settings=_NO_NETWORK),
     StartupCase(
         "simulated, vision (the default)",
-        _SIMULATED | _VISION | {"torch"},
+        _SIMULATED | _VISION | {"onnxruntime"},
         settings=("vision.checkpoint={network}",),
     ),
 )
