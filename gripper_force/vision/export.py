@@ -201,7 +201,7 @@ def export_errors(model: Model, path: Path, frames: Sequence[Gray] | None = None
         if not np.isfinite(largest) or (exact and largest > TOLERANCE * scale):
             raise CheckpointError(
                 f"the exported {path.suffix} file differs from PyTorch by {largest:.2g} in {name}; "
-                "install other versions of the packages of gripper-force[engines], or use vision.engine=torch"
+                "install other versions of PyTorch and of the packages that export, or use vision.engine=torch"
             )
     means_n = [np.array([step.forces_n.mean() for step in steps]) for steps in (expected, exported)]
     error_n = np.abs(means_n[0] - means_n[1])
