@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
@@ -477,7 +478,8 @@ def virtual_servo(
             console.show({"port": server.device_path, "model": servo.model, "ids": servo_ids}, as_json)
             sys.stdout.flush()
             console.err.print("serving until Ctrl-C")
-            signal.pause()
+            while True:  # signal.pause() would miss a signal that comes just before it
+                time.sleep(0.2)
         except KeyboardInterrupt:
             if process.interrupt_exit_code() != 128 + signal.SIGINT:
                 raise  # SIGTERM or a lost terminal; Ctrl-C is the way to end it
