@@ -542,7 +542,7 @@ class SimConfig(Section):
         description="mesh and time step; auto: the fastest level that keeps budget.sim_error_n and "
         "budget.sim_speed by the table of `gripper-force bench scene`",
     )
-    lux: Positive | None = Field(None, description="light level; null: 350, 550 or 750, drawn from the seed")
+    lux: Positive | None = Field(None, description="light level in lux; null: 350, 550 or 750, drawn by seed")
     tool: Literal["pads", "discs", "rods"] = Field(
         "pads",
         description="jaw tips: flat pads, flat round discs, or rods with round tips, which press the wall of a turned "

@@ -303,7 +303,7 @@ def export_network(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Export a network for another engine, and compare it with PyTorch."""
+    """Export a network to ONNX or OpenVINO, and compare it with PyTorch."""
     from gripper_force.jobs.dataset import find_logs, load_clips
     from gripper_force.jobs.int8_export import export_int8
     from gripper_force.vision.export import export as job

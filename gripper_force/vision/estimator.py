@@ -99,7 +99,7 @@ class ForceEstimator:
                 entry point in the group ``gripper_force.engines``, or ``package.module:Class``.
             precision: Precision of the arithmetic. Of the built-in engines only OpenVINO has ``bfloat16``.
             threads: CPU threads. With PyTorch this sets the threads of the whole process. None leaves that
-                setting as it is, and gives OpenVINO and ONNX Runtime their own default, all cores.
+                setting as it is, and gives ONNX Runtime one, and OpenVINO its default, all cores.
 
         Raises:
             CheckpointError: The network's file is missing or damaged.

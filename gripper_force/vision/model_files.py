@@ -85,7 +85,8 @@ def exported_file(model: Model, suffix: str) -> Path:
 
 def unusable(engine: str, path: Path, model: Model, error: Exception) -> CheckpointError:
     """Returns the error of an engine that can't run the file that `exported_file` named for a model."""
-    remedy = "export it again" if path == model.path else "delete it: the next run makes it again"
+    remedies = {model.path: "export it again", SHIPPED_EXPORTS / path.name: "install gripper-force again"}
+    remedy = remedies.get(path, "delete it: the next run makes it again")
     return CheckpointError(f"{engine} can't run {path}: {' '.join(str(error).split())}; {remedy}")
 
 

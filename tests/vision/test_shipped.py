@@ -7,7 +7,7 @@ from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.simulate import plan, simulate
 from gripper_force.vision.export import export_errors
 from gripper_force.vision.header import SHIPPED
-from gripper_force.vision.model_files import SHIPPED_EXPORTS, exported_name, read_model
+from gripper_force.vision.model_files import SHIPPED_EXPORTS, exported_name, read_model, unusable
 
 
 @pytest.mark.parametrize("moving", ["false", "true"])
@@ -26,3 +26,11 @@ def test_the_onnx_files_are_exports_of_the_checkpoints() -> None:
         exported = read_model(SHIPPED_EXPORTS / name)
         assert (exported.digest, exported.header) == (model.digest, model.header)
         assert export_errors(model, SHIPPED_EXPORTS / name)["largest_n"] < 1e-3
+
+
+def test_a_damaged_onnx_file_of_the_package_is_not_to_be_deleted() -> None:
+    model = read_model("small")
+    problem = unusable(
+        "ONNX Runtime", SHIPPED_EXPORTS / exported_name(model, ".onnx"), model, ValueError("it")
+    )
+    assert str(problem).endswith("; install gripper-force again")

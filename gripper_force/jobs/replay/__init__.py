@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,9 +100,7 @@ def replay_frames(
 def _may_batch(reader: LogReader, resolved: ResolvedConfig) -> bool:
     """Returns True if no estimate can equal a logged one bit for bit: then batches, which round otherwise, do."""
     model, engine = resolved.model, resolved.config.vision.engine
-    if model is None or model.path.suffix != ".safetensors" or engine not in ("onnxruntime", "torch"):
-        return False
-    return reader.metadata.get("checkpoint", "") != model.digest and find_spec("torch") is not None
+    return model is not None and engine == "torch" and reader.metadata.get("checkpoint", "") != model.digest
 
 
 class Replays(NamedTuple):

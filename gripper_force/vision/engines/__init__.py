@@ -97,7 +97,7 @@ def open_engine(
         precision: Precision of the arithmetic. Of the built-in engines only OpenVINO computes in bfloat16.
             Layers that a file holds in int8 stay in int8.
         threads: CPU threads to compute with. PyTorch has one setting for the whole process, which is changed;
-            None leaves it as it is, and gives OpenVINO and ONNX Runtime their own default, all cores.
+            None leaves it as it is, and gives ONNX Runtime one, and OpenVINO its default, all cores.
 
     Raises:
         ConfigError: The engine or the precision is unknown, a package is not installed, or the engine can't
@@ -110,7 +110,7 @@ def open_engine(
         raise ConfigError(f"vision.threads {threads!r} is not a whole number from 1 on; name one, or None")
     if precision != "float32" and engine in ENGINES and engine != "openvino":
         raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
-    other = ", or set vision.engine=onnxruntime"
+    other = "" if engine == "onnxruntime" else ", or set vision.engine=onnxruntime"
     opened: Engine = load_class("engines", ENGINES, engine, "vision.engine", other)(model, precision, threads)
     opened.step(np.zeros((model.header.preprocess.size,) * 2, np.float32))
     opened.reset()

@@ -12,12 +12,12 @@ class OnnxEngine(Engine):
     """Runs an ONNX file in float32."""
 
     def __init__(self, model: Model, precision: Precision = "float32", threads: int | None = None) -> None:
-        """Loads an ONNX file. A checkpoint is exported first, once on each machine.
+        """Loads an ONNX file. A checkpoint that is not a shipped one is exported first, once on each machine.
 
         Args:
             model: A checkpoint or an ONNX file.
             precision: Ignored; always float32.
-            threads: CPU threads; None for ONNX Runtime's default.
+            threads: CPU threads; None for one.
 
         Raises:
             ConfigError: The file was exported for another engine.
@@ -26,7 +26,8 @@ class OnnxEngine(Engine):
         super().__init__(model.header)
         path = exported_file(model, ".onnx")
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads or 0  # 0: the default
+        # Its own default pins a thread to each core, of which the control thread needs one.
+        options.intra_op_num_threads = threads or 1
         # Threads that spin while they wait would take the core that the control thread needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:

@@ -1,8 +1,8 @@
 """Dynamixel servos in current-based position mode, over the vendor's unmodified SDK.
 
 A cycle is one fast sync read and one sync write for all servos of a bus, both through indirect addresses. An XL330 or
-XC330 has too few of them for the voltage, which is read on its own every 20 cycles. Servos with older firmware are
-read by a plain sync read.
+XC330 with new firmware has too few of them for the voltage, which is read on its own every 20 cycles. Servos with old
+firmware are read by a plain sync read.
 Registers: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/.
 """
 
