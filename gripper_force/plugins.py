@@ -21,8 +21,8 @@ _METHODS: Final = {
 """Methods of each interface, which a class is checked for before one is called."""
 
 _RETURNS: Final = {"read": "ServoState", "newest": "Frame NoneType", "drain": "list tuple", "counts": "dict"}
-"""Names of the types that methods return: importing these takes time. Another type would fail later, in code that can't
-name the class."""
+"""Names of the types that methods may return; names, because importing the types takes time. A wrong type is reported
+here, where the class is known."""
 
 EXTRAS: Final = {
     **dict.fromkeys(("torch", "onnx", "onnxscript"), "train"),

@@ -228,8 +228,10 @@ class LogReader:
 
     def _describe_loss(self) -> str:
         self._recover = True
-        whole = f"{sum(1 for _ in self.records())} records ({self.duration_ns / NS_PER_S:.2f} s)"
-        return f"{self.path} is cut short, damaged or not finished yet: {whole} can be recovered; {_REMEDY}"
+        readable = f"{sum(1 for _ in self.records())} records ({self.duration_ns / NS_PER_S:.2f} s)"
+        return (
+            f"{self.path} is cut short, damaged or not finished yet: {readable} can be recovered; {_REMEDY}"
+        )
 
 
 def _checked(chunk: Chunk) -> Chunk:

@@ -141,6 +141,8 @@ class Session:
         self._raise_if_ended()
         state = self._devices.servo.start()  # if it raises, it has turned torque off itself
         self._armed = True
+        if not isinstance(state, ServoState):  # of a user's class, whose torque is on now
+            raise DeviceError(f"servo.start() returned {type(state).__name__}; return a ServoState")
         if problem := self._controller.start_problem(state):
             raise DeviceError(problem)
         self._perception.start()

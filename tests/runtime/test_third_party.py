@@ -227,6 +227,19 @@ def test_a_servo_that_fails_is_told_to_stop(config: Config, tmp_path: Path) -> N
     assert LogReader(path).complete
 
 
+def test_a_servo_whose_start_returns_nothing_is_told_to_stop(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
+    own = with_own(config, "servo", "nothing", clock="realtime", **none)
+    servo = import_module("own_devices").Servo
+    monkeypatch.setattr(servo, "stopped", [])
+    monkeypatch.setattr(servo, "start", lambda self: None)
+    with pytest.raises(DeviceError, match=r"^servo\.start\(\) returned NoneType; return a ServoState"):
+        run_grasp(own, tmp_path / "run.mcap")
+    assert servo.stopped == [False]
+
+
 def test_an_engine_and_a_module_that_fail_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_engine.py").write_text(
         "class Engine:\n    def __init__(self, *_): 1 / 0\n    def step(self, frame): ...\n"

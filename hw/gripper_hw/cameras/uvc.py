@@ -28,7 +28,7 @@ _EXPOSURE_MANUAL = 1
 """V4L2_EXPOSURE_MANUAL."""
 
 _EXPOSURES_FIXED = (_EXPOSURE_MANUAL, 2)
-"""The other one is V4L2_EXPOSURE_SHUTTER_PRIORITY, in which only the iris is automatic."""
+"""Modes with a fixed exposure time: manual, and V4L2_EXPOSURE_SHUTTER_PRIORITY, where only the iris is automatic."""
 
 _EXPOSURES_AUTOMATIC = (3, 0)
 """V4L2_EXPOSURE_APERTURE_PRIORITY, which most cameras have, and V4L2_EXPOSURE_AUTO."""

@@ -151,7 +151,7 @@ class ServoModel(Section):
         """Bits of Hardware Error Status that may turn torque off, with the factory's Shutdown.
 
         See https://emanual.robotis.com/docs/en/dxl/x/xl330-m288/#shutdown. An error of the motor's encoder is not in
-        Shutdown, but no motor is controlled without its encoder.
+        Shutdown, but counts: without its encoder a motor cannot be controlled.
         """
         return ~INPUT_VOLTAGE_ERROR & 0xFF | self.setting("shutdown")
 

@@ -156,9 +156,8 @@ class DynamixelBus:
                 firmware.append(self._read_firmware(id_))
             self.firmware = tuple(firmware)
             window = self._common_window()
-            fits = (
-                window.length > CYCLE_BYTES + _WRITE_BLOCK.size
-            )  # a read may have 7 bytes more, a write has 6
+            # The window holds the read block with up to 7 bytes of padding, and the write block of 6 bytes.
+            fits = window.length > CYCLE_BYTES + _WRITE_BLOCK.size
             self._read_size = CYCLE_BYTES if fits else _READ_BLOCK.size
             for id_ in self.ids:
                 self._configure(id_, window)

@@ -139,11 +139,12 @@ def test_exposure_can_be_automatic(make_uvc: MakeUvc) -> None:
     assert camera.settings()["exposure_us"] == "automatic"
 
 
+@pytest.mark.parametrize("fixed", [1.0, 2.0])
 @pytest.mark.parametrize("has", [{3}, {0}])
 def test_exposure_is_automatic_again_after_a_run_with_a_fixed_one(
-    make_uvc: MakeUvc, has: set[int], monkeypatch: pytest.MonkeyPatch
+    make_uvc: MakeUvc, has: set[int], fixed: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    camera = make_uvc(controls={cv2.CAP_PROP_AUTO_EXPOSURE: 1.0}, exposure_us=None)
+    camera = make_uvc(controls={cv2.CAP_PROP_AUTO_EXPOSURE: fixed}, exposure_us=None)
     open_capture = camera._open_capture
 
     def limited(path: str) -> Any:
