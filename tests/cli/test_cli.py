@@ -73,20 +73,13 @@ def sets(quick: list[str], tmp_path: Path) -> list[str]:
     return [part for one in keys for part in ("--set", one)]
 
 
-def commands(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    yield path
-    for name, command in getattr(group, "commands", {}).items():
-        yield from commands(command, (*path, name))
+def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    yield path, command
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from commands(inner, (*path, name))
 
 
-def find(path: tuple[str, ...]) -> Any:
-    command: Any = typer.main.get_command(cli.app)
-    for name in path:
-        command = command.commands[name]
-    return command
-
-
-GROUPS = {path: find(path) for path in commands(typer.main.get_command(cli.app))}
+GROUPS = dict(commands(typer.main.get_command(cli.app)))
 LEAVES = {path: command for path, command in GROUPS.items() if not hasattr(command, "commands")}
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,7 @@ def template(node: ast.expr) -> str | None:
     return None
 
 
+@cache
 def templates() -> list[str]:
     texts = []
     for path in SOURCES:
@@ -33,7 +35,6 @@ def templates() -> list[str]:
     return texts
 
 
-TEMPLATES = templates()
 MESSAGES = re.findall(r"^\| `([^`]+(?:`[^`|]*`[^`|]*)*)` \|", PAGE.read_text(), re.MULTILINE)
 
 
@@ -47,4 +48,4 @@ def test_a_message_is_in_the_source(message: str) -> None:
     parts = [part for part in message.split("…") if part.strip(" .")]
     assert sum(map(len, parts)) >= 10, "too short to be found"
     pattern = re.compile(".*".join(map(re.escape, parts)), re.DOTALL)
-    assert any(pattern.search(text) for text in TEMPLATES)
+    assert any(pattern.search(text) for text in templates())
