@@ -9,6 +9,7 @@ import sys
 import tomllib
 import zipfile
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from gripper_force.vision.engines import ENGINES
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 SOURCES = {"gripper_force": ROOT, "gripper_hw": ROOT / "hw", "gripper_calibration": ROOT / "calibration"}
-DISTRIBUTIONS = metadata.packages_distributions()
+distributions = cache(metadata.packages_distributions)
 
 
 def closure(requirements: list[str]) -> set[str]:
@@ -43,12 +44,19 @@ def closure(requirements: list[str]) -> set[str]:
 
 
 def distributions_of(module: str) -> set[str]:
-    return {canonicalize_name(name) for name in DISTRIBUTIONS.get(module, ())}
+    return {canonicalize_name(name) for name in distributions().get(module, ())}
 
 
-CORE = closure(PROJECT["dependencies"])
-ABSENT = {module for module in DISTRIBUTIONS if not distributions_of(module) & CORE} - set(SOURCES)
-"""Modules of this environment that an installation without extras does not have."""
+@cache
+def core() -> set[str]:
+    return closure(PROJECT["dependencies"])
+
+
+@cache
+def absent() -> set[str]:
+    """Modules of this environment that an installation without extras does not have."""
+    return {module for module in distributions() if not distributions_of(module) & core()} - set(SOURCES)
+
 
 ABSENCE = """
 import sys
@@ -97,8 +105,8 @@ def without_extras(
     *arguments: str, cwd: Path, code: str = MAIN, path: str | None = None
 ) -> subprocess.CompletedProcess[str]:
     """Runs the command line, or a program, in a process that has only the core's packages."""
-    hidden = {name for module in ABSENT for name in DISTRIBUTIONS[module]}
-    absence = ABSENCE.format(absent=[sorted(ABSENT), sorted(hidden)])
+    hidden = {name for module in absent() for name in distributions()[module]}
+    absence = ABSENCE.format(absent=[sorted(absent()), sorted(hidden)])
     environment = {
         **os.environ,
         **({"PYTHONPATH": path} if path else {}),
@@ -121,7 +129,7 @@ def settings(*keys: str) -> list[str]:
 
 def test_the_absence_is_real(tmp_path: Path) -> None:
     for module in ("torch", "mujoco", "matplotlib", "scipy", "depthai"):
-        assert module in ABSENT
+        assert module in absent()
         done = without_extras(cwd=tmp_path, code=f"import {module}")
         assert f"ModuleNotFoundError: No module named '{module}'" in done.stderr
     code = "import cv2, google.protobuf, mcap, numpy, onnxruntime, pydantic, safetensors, serial, typer, yaml"
@@ -167,67 +175,92 @@ def test_a_grasp_with_vision_needs_the_core_only(tmp_path: Path) -> None:
 LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "needs", "extra"),
-    [
-        (["grasp"], "log.report=true needs matplotlib", "report"),
-        (["grasp", *settings("log.report=false")], "servo.port=virtual:rig needs mujoco", "sim"),
-        (["grasp", "--trials=2"], "log.report=true needs matplotlib", "report"),
-        (
-            [
-                "grasp",
-                *settings(*REAL, "camera.backend=playback", "camera.path=frames.mcap", "vision.engine=torch"),
-            ],
-            "vision.engine=torch needs torch",
-            "train",
-        ),
-        (
-            ["grasp", *settings(*REAL, "camera.backend=none", LINKAGE)],
-            "gripper.linkage.kind=table needs scipy",
-            "calibrate",
-        ),
-        (
-            ["config", "check", *settings(*REAL, "camera.backend=oak")],
-            "camera.backend=oak needs depthai",
-            "oak",
-        ),
-        (
-            [
-                "grasp",
-                *settings(*REAL, "camera.backend=none", "load_cell.backend=phidget", "load_cell.rate_hz=80"),
-            ],
-            "load_cell.backend=phidget needs the package Phidget22",
-            "phidget",
-        ),
-        (["train", "data"], "train needs torch", "train"),
-        (["evaluate", "data"], "evaluate needs torch", "train"),
-        (["teach", "mug"], "teach needs torch", "train"),
-        (["calibrate", "object", "mug"], "calibrate object needs torch", "train"),
-        (["calibrate", "load-cell", "--mass-kg=1", "--yes"], "this command needs scipy", "calibrate"),
-        (["export", "small", "--out=small.onnx"], "this command needs torch", "train"),
-        (
-            ["replay", "frames.mcap", "--report"],
-            "--report needs matplotlib",
-            "report",
-        ),
-        (["replay", "frames.mcap", "--out=summary"], "--out needs scipy", "calibrate"),
-        (["replay", "frames.mcap", "--compare", "log", "small"], "--compare needs scipy", "calibrate"),
-        (["replay", "frames.mcap", "--ray=auto"], "--ray needs ray", "ray"),
-        (["simulate", "--presses=1"], "needs mujoco", "sim"),
-        (["view", "frames.mcap"], "the viewer rerun needs rerun", "view"),
-    ],
-)
-def test_a_missing_package_is_named_with_its_extra(
-    tmp_path: Path, arguments: list[str], needs: str, extra: str
-) -> None:
-    words = " ".join(arguments)
-    places = (VISION if "frames.mcap" in words else "") + (SERVO if "SERVO" in words else "")
-    done = without_extras(*arguments, cwd=tmp_path, code=places + MAIN)
-    assert done.returncode == 2, done.stdout + done.stderr
-    assert needs in done.stderr
-    assert f"pip install 'gripper-force[{extra}]'" in done.stderr
-    assert len([line for line in done.stderr.splitlines() if "error" in line]) == 1
-    assert "Traceback" not in done.stderr
+MISSING: list[tuple[list[str], str, str]] = [
+    (["grasp"], "log.report=true needs matplotlib", "report"),
+    (["grasp", *settings("log.report=false")], "servo.port=virtual:rig needs mujoco", "sim"),
+    (["grasp", "--trials=2"], "log.report=true needs matplotlib", "report"),
+    (
+        [
+            "grasp",
+            *settings(*REAL, "camera.backend=playback", "camera.path=frames.mcap", "vision.engine=torch"),
+        ],
+        "vision.engine=torch needs torch",
+        "train",
+    ),
+    (
+        ["grasp", *settings(*REAL, "camera.backend=none", LINKAGE)],
+        "gripper.linkage.kind=table needs scipy",
+        "calibrate",
+    ),
+    (
+        ["config", "check", *settings(*REAL, "camera.backend=oak")],
+        "camera.backend=oak needs depthai",
+        "oak",
+    ),
+    (
+        [
+            "grasp",
+            *settings(*REAL, "camera.backend=none", "load_cell.backend=phidget", "load_cell.rate_hz=80"),
+        ],
+        "load_cell.backend=phidget needs the package Phidget22",
+        "phidget",
+    ),
+    (["train", "data"], "train needs torch", "train"),
+    (["evaluate", "data"], "evaluate needs torch", "train"),
+    (["teach", "mug"], "teach needs torch", "train"),
+    (["calibrate", "object", "mug"], "calibrate object needs torch", "train"),
+    (["calibrate", "load-cell", "--mass-kg=1", "--yes"], "this command needs scipy", "calibrate"),
+    (["export", "small", "--out=small.onnx"], "this command needs torch", "train"),
+    (
+        ["replay", "frames.mcap", "--report"],
+        "--report needs matplotlib",
+        "report",
+    ),
+    (["replay", "frames.mcap", "--out=summary"], "--out needs scipy", "calibrate"),
+    (["replay", "frames.mcap", "--compare", "log", "small"], "--compare needs scipy", "calibrate"),
+    (["replay", "frames.mcap", "--ray=auto"], "--ray needs ray", "ray"),
+    (["simulate", "--presses=1"], "needs mujoco", "sim"),
+    (["view", "frames.mcap"], "the viewer rerun needs rerun", "view"),
+]
+"""Arguments of a command, what it needs, and the extra that has it."""
+
+EACH = """
+import contextlib, io, json
+from gripper_force.cli import main
+
+done = []
+for arguments in json.loads(sys.argv[1]):
+    sys.argv[1:] = arguments
+    with contextlib.redirect_stderr(io.StringIO()) as stderr:
+        try:
+            main()
+        except SystemExit as end:
+            done.append((end.code, stderr.getvalue()))
+print(json.dumps(done))
+"""
+"""Runs commands that fail, one after the other."""
+
+
+@pytest.fixture(scope="module")
+def messages(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str]]:
+    """Exit codes and messages of the commands in `MISSING`, from one process: its start takes most of the time."""
+    code = VISION + SERVO + EACH
+    commands = json.dumps([arguments for arguments, *_ in MISSING])
+    done = without_extras(commands, cwd=tmp_path_factory.mktemp("missing"), code=code)
+    assert done.returncode == 0, done.stderr
+    found: list[tuple[int, str]] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+@pytest.mark.parametrize("number", range(len(MISSING)), ids=[" ".join(row[0]) for row in MISSING])
+def test_a_missing_package_is_named_with_its_extra(messages: list[tuple[int, str]], number: int) -> None:
+    _, needs, extra = MISSING[number]
+    code, stderr = messages[number]
+    assert code == 2, stderr
+    assert needs in stderr
+    assert f"pip install 'gripper-force[{extra}]'" in stderr
+    assert len([line for line in stderr.splitlines() if "error" in line]) == 1
+    assert "Traceback" not in stderr
 
 
 def test_a_library_user_gets_a_typed_error(tmp_path: Path) -> None:
@@ -309,15 +342,15 @@ def test_every_import_is_declared() -> None:
     names = {"foxglove": "foxglove-sdk", "rerun": "rerun-sdk", "Phidget22": "phidget22"}
     for name, body in TREES.items():
         for module in third_party(set(imports(body, lazy=True))):
-            distributions = distributions_of(module) or {names.get(module, module)}
-            if not distributions & declared and not (
+            sources = distributions_of(module) or {names.get(module, module)}
+            if not sources & declared and not (
                 module == "pytest" and name.startswith("gripper_force.testing")
             ):
                 assert any(
                     EXTRAS.get(module) == extra
                     for extra, texts in PROJECT["optional-dependencies"].items()
                     for text in texts
-                    if canonicalize_name(Requirement(text).name) in distributions
+                    if canonicalize_name(Requirement(text).name) in sources
                 ), f"{name} imports {module}, which no extra declares"
 
 
@@ -361,7 +394,7 @@ def test_optional_packages_are_reached_only_lazily() -> None:
     starts += [f"gripper_force.jobs.{job}" for job in jobs] + own_class_modules()
     for start in starts:
         optional = {
-            module: via for module, via in loaded_with(start).items() if not distributions_of(module) & CORE
+            module: via for module, via in loaded_with(start).items() if not distributions_of(module) & core()
         }
         assert set(optional) <= own.get(start, set()), f"{start}: {optional}"
 
