@@ -15,6 +15,7 @@ from gripper_force.qualification.numerics.reference import (
     Float64Result,
     ReferenceEnsemble,
 )
+from gripper_force.types import Gray
 from gripper_force.vision import estimator
 from gripper_force.vision.engines import Engine, Floats, StepOutput
 from gripper_force.vision.frame_checks import FrameChecks
@@ -46,15 +47,23 @@ def reference(tiny_checkpoint: Path, tmp_path: Path) -> ReferenceEnsemble:
     return ReferenceEnsemble(read_model(tiny_checkpoint), tmp_path)
 
 
+def undisturbed(clip: Gray, _seed: int) -> dict[str, Gray]:
+    """The first of the cases with frames, which are many."""
+    return {"undisturbed grasp": clip}
+
+
 def broken(rows: list[NumericalCase]) -> list[str]:
     return [row.case for row in rows if not row.ok]
 
 
-def test_every_case_is_within_its_bound(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_case_is_within_its_bound(
+    tiny_checkpoint: Path, fused_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Covers the cases that need no export. Those of the head's fit have a test of their own."""
+    monkeypatch.setattr(suite, "make_log", lambda *_: fused_log)  # two more grasps take seconds
     monkeypatch.setattr("gripper_force.qualification.numerics.head_fit_cases.cases", lambda: iter(()))
     config = Config.model_validate({"vision": {"checkpoint": str(tiny_checkpoint)}})
-    rows = list(suite.cases(config, None, streamed=300, long=300, variants=TORCH))
+    rows = list(suite.cases(config, None, streamed=150, long=150, variants=TORCH))
     assert broken(rows) == []
     assert len({row.case for row in rows}) == len(rows)
 
@@ -72,6 +81,8 @@ def test_a_wrong_engine_is_found(reference: ReferenceEnsemble, grasp: Clip) -> N
 def test_wrong_frame_preparation_is_found(
     reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(suite, "disturbed", undisturbed)
+    assert broken(list(suite._frames(reference, grasp, Config()))) == []
     monkeypatch.setattr(suite, "DIFFERENCE_GAIN", 2.01)
     assert "undisturbed grasp" in broken(list(suite._frames(reference, grasp, Config())))
 
@@ -79,6 +90,7 @@ def test_wrong_frame_preparation_is_found(
 def test_missing_frame_checks_are_found(
     reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(suite, "disturbed", undisturbed)
     monkeypatch.setattr(FrameChecks, "check", lambda _self, _small: None)
     assert "black, gray or white frames from the start" in broken(
         list(suite._frames(reference, grasp, Config()))
@@ -110,7 +122,7 @@ def test_a_drifting_stream_is_found(
     reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pool = suite._inputs(reference, grasp)
-    drift_n, _, _, last = suite._stream(reference, ENGINE_VARIANTS[0], pool, 300)
+    drift_n, _, _, last = suite._stream(reference, ENGINE_VARIANTS[0], pool, 60)
     bound_n = reference.bound_n(last, ROUNDING["float32"]).max()
     assert drift_n <= bound_n
     right = Engine.step
@@ -124,7 +136,7 @@ def test_a_drifting_stream_is_found(
         )
 
     monkeypatch.setattr(Engine, "step", step)
-    assert suite._stream(reference, ENGINE_VARIANTS[0], pool, 300)[0] > bound_n
+    assert suite._stream(reference, ENGINE_VARIANTS[0], pool, 60)[0] > bound_n
 
 
 def test_a_case_is_that_of_the_worst_member() -> None:
