@@ -4,7 +4,9 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -34,7 +36,9 @@ def config_of(*overrides: str) -> Config:
     return load_config(None, ["object=none", "sim.detail=coarse", "camera.backend=none", *overrides])
 
 
+@cache
 def home(*overrides: str) -> JawsResult:
+    """The result with these settings, which several tests read."""
     asked: list[str] = []
     result = calibrate_jaws(config_of(*overrides), prompt=lambda text: asked.append(text))
     assert asked == ["Take everything from between the jaws and open them by hand"]
@@ -118,16 +122,11 @@ def test_jaws_that_nothing_moves_are_named() -> None:
         home("sim.friction=20")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["object=block"], "the jaws move by 1.* rad between their ends, but the configured geometry has 2"),
-        (["object=sponge"], "nothing lies between"),
-    ],
-)
-def test_contradictory_travel_is_refused(overrides: list[str], message: str) -> None:
-    with pytest.raises(DataError, match=message):
-        home(*overrides)
+def test_contradictory_travel_is_refused() -> None:
+    with pytest.raises(
+        DataError, match=r"move by 1.* rad between their ends, but the configured geometry has 2"
+    ):
+        home("object=block")
 
 
 def test_half_open_jaws_are_refused() -> None:
@@ -191,7 +190,14 @@ def test_device_failure_turns_torque_off(monkeypatch: pytest.MonkeyPatch) -> Non
     assert buses[0].servos[0].get("torque_enable") == 0
 
 
-def test_command_prints_the_configuration() -> None:
+def test_command_prints_the_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    found_jaws: list[JawsResult] = []
+
+    def calibrate_once(*arguments: Any, **named: Any) -> JawsResult:
+        found_jaws[:] = found_jaws or [calibrate_jaws(*arguments, **named)]
+        return found_jaws[0]
+
+    monkeypatch.setattr(procedure, "calibrate_jaws", calibrate_once)
     call = ["calibrate", "jaws", "--yes", "--set", "object=none", "--set", "sim.detail=coarse"]
     done = CliRunner().invoke(app, call)
     assert done.exit_code == 0
