@@ -1,9 +1,7 @@
 """`bench recognition` on one simulated press."""
 
 import json
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +22,10 @@ ROWS = (
 )
 
 
-@contextmanager
-def threads(count: int) -> Iterator[Executor]:
-    with ThreadPoolExecutor(count) as pool:  # another process would not see the rows of this test
-        yield pool
-
-
 @pytest.fixture
-def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object) -> list[str]:
     monkeypatch.setattr(recognition, "ROWS", ROWS)
-    monkeypatch.setattr(recognition, "process_pool", threads)
+    monkeypatch.setattr(recognition, "process_pool", thread_pool)
     call = ["bench", "recognition", "--presses", "1", "--jobs", "1", "--out", str(tmp_path)]
     return [*call, "--set", "vision.checkpoint=small", "--set", "sim.detail=coarse"]
 

@@ -142,12 +142,13 @@ def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPa
 
 
 def test_search_continues_where_it_was_interrupted(
-    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
 ) -> None:
     keep = tmp_path / "search.jsonl"
     whole = search(config, 6, 1, keep)
     lines = keep.read_text().splitlines(keepends=True)
     keep.write_text("".join(lines[:4]) + lines[4][:20])  # the last line is cut
+    monkeypatch.setattr(safety_search, "process_pool", thread_pool)  # `whole` is from a process
     counts: list[int] = []
 
     def progress(text: str, steps: int = 1) -> None:

@@ -176,7 +176,10 @@ def matrix(kept: Path) -> list[faults.RowSummary]:
     return summaries
 
 
-def test_an_interrupted_matrix_continues(matrix: list[faults.RowSummary], kept: Path) -> None:
+def test_an_interrupted_matrix_continues(
+    matrix: list[faults.RowSummary], kept: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
+) -> None:
+    monkeypatch.setattr(faults, "process_pool", thread_pool)  # `matrix` ran in a process
     lines = kept.read_text().splitlines()
     kept.write_text("\n".join(lines[:-1]) + "\n")
     again = list(run_matrix(FAST, 1, 1, 1, kept, resume=True, rows=TWO_ROWS))

@@ -12,6 +12,7 @@ from gripper_force.config import config_from, load_config
 from gripper_force.control.limits import Limits
 from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import SpeedLimit
+from gripper_force.qualification.fault_matrix import wrong_configurations
 from gripper_force.qualification.fault_matrix.wrong_configurations import (
     WRONG_CASES,
     WrongCase,
@@ -139,7 +140,9 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("wrong") / "wrong.jsonl"
 
 
-def test_a_table_runs_in_both_clocks_and_continues(kept: Path) -> None:
+def test_a_table_runs_in_both_clocks_and_continues(
+    kept: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
+) -> None:
     rows = (row("friction", object="stapler", sim__friction=5.0), row("closing", object="none"))
     names: list[str] = []
 
@@ -151,6 +154,7 @@ def test_a_table_runs_in_both_clocks_and_continues(kept: Path) -> None:
     assert (stuck["runs"], stuck["ok"], stuck["results"]) == (2, 2, {"stuck": 2})
     assert (stuck["live_runs"], stuck["live_ok"], stuck["live_results"]) == (1, 1, {"stuck": 1})
     assert empty["results"] == {"no_object": 2}
+    monkeypatch.setattr(wrong_configurations, "process_pool", thread_pool)
     lines = kept.read_text().splitlines()
     kept.write_text("\n".join(lines[:-1]) + "\n")
     assert next(iter(run_rows(FAST, 2, 1, 1, kept, resume=True, rows=rows))) == stuck
@@ -159,9 +163,10 @@ def test_a_table_runs_in_both_clocks_and_continues(kept: Path) -> None:
     )
 
 
-def test_the_command_reports_a_row_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gripper_force.qualification.fault_matrix import wrong_configurations
-
+def test_the_command_reports_a_row_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
+) -> None:
+    monkeypatch.setattr(wrong_configurations, "process_pool", thread_pool)
     case = row("friction", object="stapler", sim__friction=5.0)
     summary = next(
         iter(run_rows(FAST, 1, 0, 1, tmp_path / "w.jsonl", rows=[replace(case, expected=("held",))]))

@@ -1,7 +1,9 @@
 import math
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,24 @@ from gripper_force.qualification.paper.paper_tables import comparison
 from .conftest import FRAMES
 
 TINY = Scale(size=32, width=0.25, steps=2, seeds=2)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _in_threads(thread_pool: object) -> Iterator[None]:
+    """Trains in this process, except where an end of the time kills a training; test_paper_page has a process."""
+    threads, train_all = torch.get_num_threads(), experiment._train_all
+
+    def train_here(*arguments: Any) -> None:
+        *_, end_s, _ = arguments
+        with pytest.MonkeyPatch.context() as patch:
+            if end_s == math.inf:
+                patch.setattr(experiment, "process_pool", thread_pool)
+            train_all(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, "_train_all", train_here)
+        yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -115,11 +135,9 @@ def test_an_interrupted_run_gives_the_same_table(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(module, "STATE_EVERY_S", -1.0)
-    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.raises(KeyboardInterrupt):
         train(recipe, load_clips(touches / "train", recipe.preprocess), path, progress=end_in_step_2)
-    torch.set_num_threads(threads)
     assert [state.exists() for state in (*module.state_paths(recipe, path), path)] == [True, False]
     (resumed,) = again(touches, tmp_path, TINY)
     assert comparison(resumed, "3") == comparison(test, "3")
