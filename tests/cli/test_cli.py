@@ -17,6 +17,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from gripper_calibration.procedures import calibrate_servo
 from gripper_force import cli
 from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
@@ -848,6 +849,21 @@ def test_paths_with_brackets_are_shown_whole(capsys: pytest.CaptureFixture[str])
     assert "data/[old]/a[/x].mcap" in capsys.readouterr().out
 
 
+@pytest.fixture(scope="module")
+def measured_once() -> Iterator[None]:
+    """The gauge is pressed once for the tests of what `calibrate servo` writes where."""
+    measure, found = calibrate_servo.measure, []
+
+    def once(*arguments: Any) -> Any:
+        found[:] = found or [measure(*arguments)]
+        return found[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibrate_servo, "measure", once)
+        yield
+
+
+@pytest.mark.usefixtures("measured_once")
 def test_a_calibration_does_not_write_its_rig_profile_over_the_rig_file_of_setup(run: Run) -> None:
     rig = Path("rig.yaml")
     rig.write_text("object: block\nsim: {detail: coarse}\n")
@@ -858,6 +874,7 @@ def test_a_calibration_does_not_write_its_rig_profile_over_the_rig_file_of_setup
     assert (rig.read_text(), Path("rig_profile.yaml").exists()) == (text, True)
 
 
+@pytest.mark.usefixtures("measured_once")
 def test_a_calibration_replaces_a_damaged_rig_profile_of_its_file(run: Run) -> None:
     Path("old.yaml").write_text("format: gripper-force-rig/0")
     Path("my.yaml").write_text("object: block\nsim: {detail: coarse}\ncalibration: {rig: old.yaml}\n")
