@@ -44,7 +44,7 @@ def test_everything_has_a_default() -> None:
     assert load_config() == Config()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(configs)
 def test_what_is_dumped_is_read_back_as_it_was(config: Config) -> None:
     assert config_from_text(dump_config(config), "the test") == config

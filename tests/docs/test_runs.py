@@ -52,6 +52,7 @@ REPLACED = {
     r'overrides=\["object=sponge"\]': 'overrides=["object=sponge", "sim.detail=coarse", "vision.checkpoint=small"]',
     r"\bmug\b": "lemon",
     " --pause": "",  # nobody is there to press Enter
+    r"\bcontrol\.hold_s=[1-9]\d*": "control.hold_s=0.3",
     r"--trials \d+": "--trials 2",
     r"--(presses|taps|grasps) [1-9]\d*": r"--\1 5",
     r"--sets \d+": "--sets 2",

@@ -60,7 +60,7 @@ def test_scattered_touches_give_a_wide_interval(touched: Callable[..., Touches])
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_few_touches_have_a_wider_interval_than_many(touched: Callable[..., Touches], count: int) -> None:
-    few, many = (fit_correction(touched(n, gain=1.3, scatter=0.03)) for n in (count, 16))
+    few, many = (fit_correction(touched(n, gain=1.3, scatter=0.03)) for n in (count, 8))
     assert few.interval.share > many.interval.share
 
 
@@ -168,7 +168,7 @@ def test_touches_that_contradict_each_other_leave_the_network_as_it_is(
     touched: Callable[..., Touches], count: int
 ) -> None:
     left = 0
-    for seed in range(12):
+    for seed in range(6):
         fit = fit_correction(touched(count, scatter=0.5, seed=seed))
         assert fit.after_n is not None
         assert fit.after_n <= fit.before_n + 1e-9

@@ -16,7 +16,7 @@ from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
 from gripper_force.vision.engines import ENGINES, Engine, Precision, open_engine
 from gripper_force.vision.header import Attention, Header, Model, NetworkConfig, Residual
-from gripper_force.vision.model_files import cache_folder, exported_file, read_model
+from gripper_force.vision.model_files import cache_folder, exported_file, exported_name, read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
@@ -162,7 +162,10 @@ def test_damaged_file_of_the_cache_is_to_be_deleted(
     needs(name)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     model = read_model(write(tmp_path / "own.safetensors", ("none", 1, "mobile")))
-    path = exported_file(model, suffix)
+    path = cache_folder() / exported_name(model, suffix)
+    if suffix == ".xml":
+        exported_file(model, suffix)  # of its two files, that of the weights gets damaged
+    path.parent.mkdir(exist_ok=True)
     path.with_suffix(".bin" if suffix == ".xml" else suffix).write_bytes(b"")
     with pytest.raises(CheckpointError, match=f"can't run {path}: .*; delete it") as raised:
         open_engine(model, name)
