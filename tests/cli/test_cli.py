@@ -18,6 +18,7 @@ import typer
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures import calibrate_servo
+from gripper_calibration.procedures.servo_measurement import measure
 from gripper_force import cli
 from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
@@ -852,7 +853,7 @@ def test_paths_with_brackets_are_shown_whole(capsys: pytest.CaptureFixture[str])
 @pytest.fixture(scope="module")
 def measured_once() -> Iterator[None]:
     """The gauge is pressed once for the tests of what `calibrate servo` writes where."""
-    measure, found = calibrate_servo.measure, []
+    found: list[Any] = []
 
     def once(*arguments: Any) -> Any:
         found[:] = found or [measure(*arguments)]
