@@ -3,6 +3,7 @@
 A network returns a force for any image, so flat, badly exposed, garbled and disturbed frames are rejected first.
 """
 
+from statistics import median
 from typing import Final
 
 import cv2
@@ -82,14 +83,13 @@ class FrameChecks:
                 object that was there is gone. Its force is NaN.
         """
         pixels = small.astype(np.float32)
-        contrast = float(pixels.std())
+        brightness, contrast = (float(value.item()) for value in cv2.meanStdDev(pixels))
         if contrast < FLAT_STD:
-            level = pixels.mean()
             raise DataError(
-                f"the camera's image is flat (gray level {level:.0f}); check its lens, light and exposure"
+                f"the camera's image is flat (gray level {brightness:.0f}); check its lens, light and exposure"
             )
-        roughness = float(np.abs(np.diff(pixels)).mean()) / contrast
-        present = float(pixels.mean()), contrast, roughness
+        steps = cv2.norm(pixels[:, 1:], pixels[:, :-1], cv2.NORM_L1) / pixels[:, 1:].size
+        present = brightness, contrast, steps / contrast
         if self._first is None:
             self._first = present
             if len(pixels) >= _MIN_PX:
@@ -114,13 +114,14 @@ class FrameChecks:
             pixels: Cropped and resized frame, (S, S).
         """
         smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING_PX)
-        difference = _sampled(smooth - self._smooth)  # (N,)
-        change = np.zeros(self._directions.shape[1], np.float32)
+        directions, difference = self._fitted[:-1], self._fitted[-1]  # (7, N), (N,)
+        difference[:] = (smooth - self._smooth).take(self._sampled)
+        change = np.zeros(len(directions), np.float32)
         for scale in _FIT_SCALES:
-            weight = (1 + np.square((difference - self._directions @ change) / scale)) ** -2
-            weighted = np.multiply(self._directions, weight[:, None], out=self._weighted).T
-            change = np.linalg.solve(weighted @ self._directions + self._prior, weighted @ difference)
-        still = np.abs(difference - self._directions @ change) < 2 * _FIT_SCALES[-1]
+            weight = 1 / np.square(1 + np.square((difference - change @ directions) / scale))
+            sums = np.multiply(directions, weight, out=self._weighted) @ self._fitted.T  # (7, 8)
+            change = cv2.solve(sums[:, :-1] + self._prior, sums[:, -1:], flags=cv2.DECOMP_CHOLESKY)[1][:, 0]
+        still = np.abs(difference - change @ directions) < 2 * _FIT_SCALES[-1]
         if still.mean() < _MIN_STILL:  # nothing to compare with
             change[:], still[:] = 0, False
         shift, zoom = float(np.hypot(*change[:2])), float(abs(change[2]))
@@ -128,7 +129,7 @@ class FrameChecks:
         detail = _block_means(np.square(cv2.Laplacian(smooth, cv2.CV_32F)))
         ratio = (detail + _DETAIL_NOISE) / (self._detail + _DETAIL_NOISE)
         kept = ratio[_block_means(still.reshape(_SAMPLED_SIDE, -1).astype(np.float32)) > 0.7]
-        blur = 1 - float(np.median(kept)) if len(kept) else 0.0
+        blur = 1 - median(kept.tolist()) if len(kept) else 0.0
         covered = float((ratio < 0.3).mean())
         light = f"the light changed by {slope:.0%} more at one side than in the middle"
         hidden = f"{covered:.0%} of the image lost its detail, as if it was covered, over vision.max_covered,"
@@ -145,24 +146,19 @@ class FrameChecks:
         self._smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING_PX)
         self._detail = _block_means(np.square(cv2.Laplacian(self._smooth, cv2.CV_32F)))
         side = len(pixels)
+        along = ((np.arange(_SAMPLED_SIDE) + 0.5) * side / _SAMPLED_SIDE).astype(int)
+        self._sampled = (along[:, None] * side + along).ravel()  # (N,), indices of evenly spaced pixels
         y, x = np.meshgrid(*[np.linspace(-1, 1, side, dtype=np.float32)] * 2, indexing="ij")
         # Gray levels per shift by one side, and per zoom about the middle.
-        right, down = (
-            cv2.Sobel(self._smooth, cv2.CV_32F, *axis, scale=-side / 8) for axis in ((1, 0), (0, 1))
-        )
+        right, down = (cv2.Sobel(self._smooth, cv2.CV_32F, dx, 1 - dx, scale=-side / 8) for dx in (1, 0))
         zoom = (right * x + down * y) / 2
-        parts = (right, down, zoom, np.ones_like(x), self._smooth - self._smooth.mean(), x, y)
-        self._directions = np.stack([_sampled(part) for part in parts], axis=1)  # (N, 7)
+        ones, zeros = np.ones_like(x), np.zeros_like(x)  # each frame replaces the zeros by its difference
+        parts = (right, down, zoom, ones, self._smooth - self._smooth.mean(), x, y, zeros)
+        self._fitted = np.stack([part.take(self._sampled) for part in parts])  # (8, N)
         # A new array for each step would take longer than the step.
-        self._weighted = np.empty_like(self._directions)
+        self._weighted = np.empty_like(self._fitted[:-1])
         # A direction that no texture shows stays at zero.
-        self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
-
-
-def _sampled(image: Floats) -> Floats:
-    """Returns evenly spaced pixels, (N,)."""
-    where = ((np.arange(_SAMPLED_SIDE) + 0.5) * len(image) / _SAMPLED_SIDE).astype(int)
-    return np.asarray(image[np.ix_(where, where)].ravel(), image.dtype)
+        self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * self._fitted.shape[1] / 400)
 
 
 def _block_means(image: Floats) -> Floats:
