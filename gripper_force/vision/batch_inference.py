@@ -105,7 +105,14 @@ def stream_features(
         device: As for `predict`.
         precision: Arithmetic of the backbone and attention of a network with windows; all else is float32.
     """
-    yield from _run(networks, _normalised(_batches(frames, torch.device(device)), preprocess), precision)
+    streams = [_NetworkStream(network, precision) for network in networks]
+    for batch in _normalised(_batches(frames, torch.device(device)), preprocess):
+        for stream in streams:
+            stream.push(batch)
+        if streams[0].pending_frames >= CHUNK:
+            yield _read(streams)
+    if streams[0].pending_frames:
+        yield _read(streams)
 
 
 def _batches(frames: Iterable[Gray], device: torch.device) -> Iterator[Tensor]:
@@ -127,37 +134,6 @@ def _normalised(parts: Iterator[Tensor], preprocess: Preprocess) -> Iterator[Ten
         leading = torch.cat(first, dim=1)[:, : preprocess.reference_frames]
         for part in chain(first, parts):
             yield normalise(part, leading, preprocess)
-
-
-@torch.inference_mode()
-def prepared_features(
-    networks: Sequence[Member], batches: Iterable[npt.NDArray[np.float32]]
-) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
-    """Yields `features` of consecutive frames, on the CPU.
-
-    Args:
-        networks: As for `features`.
-        batches: Frames of a stream that are prepared already, (N, S, S): `BATCH` each, but for the last.
-    """
-    yield from _run(networks, (torch.from_numpy(batch)[None, :, None] for batch in batches))
-
-
-def _run(
-    networks: Sequence[Member], batches: Iterable[Tensor], precision: Precision = "float32"
-) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
-    """Runs the networks on consecutive batches of a recording's prepared frames, (1, N, 1, S, S) each.
-
-    Yields:
-        Each member's forces, (M, K), and the members' features, (K, F), of the next `CHUNK` frames or the last ones.
-    """
-    streams = [_NetworkStream(network, precision) for network in networks]
-    for batch in batches:
-        for stream in streams:
-            stream.push(batch)
-        if streams[0].pending_frames >= CHUNK:
-            yield _read(streams)
-    if streams[0].pending_frames:
-        yield _read(streams)
 
 
 def _read(streams: "Sequence[_NetworkStream]") -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:

@@ -143,13 +143,6 @@ class ForceEstimator:
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network returned NaN or infinity.
         """
-        step = None
-        for frame in self.prepare(gray):
-            step = self._engine.step(frame)
-        return None if step is None else self.finish(step)
-
-    def prepare(self, gray: Gray) -> list[Floats]:
-        """Checks the next frame, and returns the network's inputs that are ready: the first half of `update`."""
         small = downscale(gray, self._region, self._preprocess.size)
         # The region is in pixels, and the reference shows the view of another size.
         if self._shape not in (None, gray.shape):
@@ -157,10 +150,13 @@ class ForceEstimator:
             raise DataError(f"the frame is {gray.shape}, but the stream began with {self._shape}; {remedy}")
         self._frame_checks.check(small)
         self._shape = gray.shape
-        return self._normaliser.push(small)
+        step = None
+        for frame in self._normaliser.push(small):
+            step = self._engine.step(frame)
+        return None if step is None else self._estimate(step)
 
-    def finish(self, step: StepOutput) -> ForceEstimate:
-        """Returns the estimate for the networks' next output: the second half of `update`."""
+    def _estimate(self, step: StepOutput) -> ForceEstimate:
+        """Returns the estimate for the networks' output."""
         forces: list[float] = step.forces_n.tolist()
         self._attention = step.attention
         if not all(math.isfinite(force) for force in forces):

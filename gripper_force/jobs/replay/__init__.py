@@ -69,7 +69,7 @@ def replay_frames(
     reader = LogReader(Path(path), recover=recover)
     resolved = resolve_replay(changed_config(reader, checkpoint, overrides))
     series = EstimateSeries()
-    agreement = feed(reader, resolved, series, in_batches=_may_batch(reader, resolved))
+    agreement = feed(reader, resolved, series)
     flags = [flag for flag in (agreement.estimates, agreement.decisions) if flag is not None]
     cells = series.cells.sorted()
     sources = errors_by_source(series, cells)
@@ -95,12 +95,6 @@ def replay_frames(
         log=str(path),
     )
     return result, columns_of(result.log, resolved.config.object, series, cells)
-
-
-def _may_batch(reader: LogReader, resolved: ResolvedConfig) -> bool:
-    """Returns True if no estimate can equal a logged one bit for bit: then batches, which round otherwise, do."""
-    model, engine = resolved.model, resolved.config.vision.engine
-    return model is not None and engine == "torch" and reader.metadata.get("checkpoint", "") != model.digest
 
 
 class Replays(NamedTuple):

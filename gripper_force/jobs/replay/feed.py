@@ -9,10 +9,10 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
-from gripper_force.jobs.replay.estimates import estimates_by_frame, estimates_in_batches
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.runtime.resolve import ResolvedConfig, make_controller, resolve_vision
+from gripper_force.runtime.perception import FrameProcessor
+from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve_vision
 from gripper_force.types import (
     Frame,
     FusedForce,
@@ -73,7 +73,7 @@ def resolve_replay(config: Config) -> ResolvedConfig:
     )
 
 
-def run_again(reader: LogReader, resolved: ResolvedConfig, *, in_batches: bool = False) -> Replayed:
+def run_again(reader: LogReader, resolved: ResolvedConfig) -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs.
 
     If faults were injected into the run's estimator, the controller gets the logged estimates.
@@ -81,11 +81,9 @@ def run_again(reader: LogReader, resolved: ResolvedConfig, *, in_batches: bool =
     Args:
         reader: The log.
         resolved: Its configuration.
-        in_batches: Computes the networks on many frames at a time, with PyTorch. Its rounding differs in the last
-            digits from that of a run, which has one frame at a time.
     """
     kept = _Kept([], [], [])
-    agreement = feed(reader, resolved, kept, in_batches=in_batches)
+    agreement = feed(reader, resolved, kept)
     return Replayed(
         agreement.estimates, agreement.decisions, agreement.changed, kept.visual, kept.decisions, kept.cells
     )
@@ -129,7 +127,7 @@ class Agreement(NamedTuple):
     changed: dict[str, float]
 
 
-def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink, *, in_batches: bool) -> Agreement:
+def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink) -> Agreement:
     """Runs estimator and controller on a log, as `run_again`. Keeps no record for longer than it is needed."""
     config = resolved.config
     is_faulty = has_faulty_estimates(config)
@@ -145,10 +143,10 @@ def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink, *, in_batches:
     fused = _RecordMatcher(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
     status = _RecordMatcher(lambda s: s)
     matcher_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
-    estimated = estimates_in_batches if in_batches and resolved.model is not None else estimates_by_frame
-    for record, estimate in estimated(reader.records(), resolved):
+    processor = FrameProcessor(make_estimator(resolved))
+    for record in reader.records():
         if isinstance(record, Frame):
-            if estimate is not None:
+            if (estimate := processor.process(record).visual) is not None:
                 sink.add_visual(estimate)
                 estimates.add_replayed(estimate)
                 if not had_network:  # so the log has no time at which an estimate was ready

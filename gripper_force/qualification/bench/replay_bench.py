@@ -17,7 +17,7 @@ from gripper_force.jobs.dataset import find_logs
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S
 
-COMMANDS: Final = ("replay --set vision.engine=torch", "evaluate", "evaluate --set vision.precision=bfloat16")
+COMMANDS: Final = ("replay", "evaluate", "evaluate --set vision.precision=bfloat16")
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class ReplayRate:
 
     Attributes:
         command: One of `COMMANDS`.
-        checkpoint: The network. It is not the logs' own, so that PyTorch computes it in batches.
+        checkpoint: The network.
         where: ``1 process``, ``N processes`` or ``Ray, N workers``.
         rates: Seconds of log for each second of the command, its start included; one for each round.
         mae_n: Mean absolute error of vision that `evaluate` found; None for a replay.
