@@ -7,7 +7,7 @@ RUN apt-get update \
     && rm -rf /var/lib/apt/lists/*
 # Sources and pip's downloads are mounted, so neither gets into the image.
 RUN --mount=type=bind,target=/src --mount=type=cache,target=/root/.cache/pip \
-    pip install --extra-index-url https://download.pytorch.org/whl/cpu '/src[report,sim,train]'
+    pip install '/src[calibrate,report,sim]'
 # Any user may be given by --user, even one without an account.
 RUN install -d -m 1777 /data /data/runs
 ENV HOME=/tmp

@@ -16,7 +16,7 @@ _METHODS: Final = {
     "servos": ("spec", "start", "read", "write", "stop", "close"),
     "cameras": ("newest", "start", "counts", "close"),
     "load_cells": ("drain", "start", "counts", "close"),
-    "engines": ("step",),
+    "engines": ("step", "warm_up"),
 }
 """Methods of each interface, which a class is checked for before one is called."""
 

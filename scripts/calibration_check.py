@@ -16,6 +16,7 @@ import multiprocessing
 import os
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,10 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.grasp import grasp
 from gripper_force.profiles.object_profile import read_object
-from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.engines import open_engine
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.ood import OodScore
+from gripper_force.vision.stream_inference import features
 
 KINDS = ("sponge", "paper_cup", "tube", "stapler", "ball")
 COUNTS = (1, 2, 4, 8, 16)
@@ -72,10 +74,12 @@ def errors(kind: str, number: int, out: Path, touched: int, tested: int) -> list
         rows: list[dict[str, Any]] = json.loads(kept.read_text())
         return rows
     paths = list(record_touches(configure(kind, number, out), touched, None, out / f"{kind}-{number}"))
-    checkpoint = load_checkpoint()
-    ood = checkpoint.header.ood
+    engine = open_engine(read_model("default"))
+    ood = engine.header.ood
     assert ood is not None  # the shipped network has one
-    touches = touch_logs.join({path: touch_logs.read_log(path, checkpoint) for path in paths}).touches
+    run = partial(features, engine)
+    read = {path: touch_logs.read_log(path, engine.header.preprocess, run) for path in paths}
+    touches = touch_logs.join(read).touches
     test = touches.only(touches.numbers[-tested:])
     rng = np.random.default_rng(number)
     before_n = float(np.abs(test.estimate_n - test.force_n).mean())

@@ -1,6 +1,6 @@
 """Data of the fits from logs: touches, presses for the loop's plant, and the settings they belong to."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -17,9 +17,9 @@ from gripper_force.jobs.dataset import CONTACT_N, read_clip, starts_in_contact
 from gripper_force.jobs.metrics import lag_s
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
-from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Phase, Record, ServoState
-from gripper_force.vision.batch_inference import features
-from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.types import NS_PER_S, Frame, GraspStatus, Gray, LoadCellSample, Phase, Record, ServoState
+from gripper_force.vision.engines import Floats as Singles
+from gripper_force.vision.preprocess import Preprocess
 
 _CONTACT_SHARE: Final = 0.05
 _FREE_FRAMES: Final = 5
@@ -96,8 +96,15 @@ def join(recordings: dict[Path, TouchRecording]) -> TouchRecording:
     )
 
 
-def read_log(path: Path, checkpoint: Checkpoint) -> TouchRecording:
-    """Reads a log, once, and runs the network on its frames. An imported recording has no presses.
+def read_log(
+    path: Path, preprocess: Preprocess, features: Callable[[Gray], tuple[Singles, Singles]]
+) -> TouchRecording:
+    """Reads a log, once, and runs the networks on its frames. An imported recording has no presses.
+
+    Args:
+        path: The log.
+        preprocess: Preparation of the frames.
+        features: Returns the networks' forces and features for a recording, as `stream_inference.features` does.
 
     Raises:
         DataError: The log contains no frames or no labels.
@@ -106,15 +113,14 @@ def read_log(path: Path, checkpoint: Checkpoint) -> TouchRecording:
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
     records = _RecordCollector()
-    preprocess = checkpoint.header.preprocess
     clip = read_clip(reader, config, records.tee(reader.records(*_record_types(config))), preprocess)
-    forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
     labelled = clip.labelled(preprocess.lead_in)
     if not labelled.any():
         raise DataError(
             f"{path} has no label after its first {preprocess.lead_in} frames, which the network needs as "
             "lead-in; record longer"
         )
+    forces_n, read_out = features(clip.frames)
     estimate_n = forces_n.mean(0).astype(np.float64)
     force_n = clip.forces_n.astype(np.float64)
     numbers = np.unique(touch_numbers(force_n)[labelled], return_inverse=True)[1]

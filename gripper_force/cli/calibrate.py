@@ -259,7 +259,7 @@ def object_(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate an object by touching it with the load cell in place. Ctrl-C uses the touches so far."""
-    require("torch", "calibrate object")
+    require("scipy", "calibrate object")
     from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
     from gripper_force.jobs.dataset import find_logs

@@ -15,12 +15,12 @@ from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.export import (
     ExportErrors,
     export_errors,
-    inputs_of,
     openvino_network,
     save_openvino,
     written,
 )
 from gripper_force.vision.header import KEY, Header, Model, Residual
+from gripper_force.vision.stream_inference import stream
 
 _SAMPLES: Final = 300
 """Frames that the recordings must hold, and about the largest number to calibrate on; NNCF's default."""
@@ -83,9 +83,8 @@ def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
 
     engine = _InputRecorder(model, max(1, sum(len(clip) for clip in frames) // _SAMPLES))
     for clip in frames:
-        engine.reset()
-        for frame in inputs_of(model, clip):
-            engine.step(frame)
+        for _ in stream(engine, clip):
+            pass  # the engine keeps what its layers take
     kept = {"Convolution", "GroupConvolution"}
     nodes = network.get_ops()
     others = sorted({node.get_type_name() for node in nodes} - kept)

@@ -17,12 +17,12 @@ from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.plugins import importing
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.engines import Engine, Floats, StepOutput, open_engine
+from gripper_force.vision.engines import open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
 from gripper_force.vision.header import EXPORTED, KEY, Model
 from gripper_force.vision.model_files import WEIGHTS, cache_folder, weights_digest
-from gripper_force.vision.preprocess import Normaliser
+from gripper_force.vision.stream_inference import stream
 
 TOLERANCE: Final = 1e-4
 """Largest difference of an exported network from PyTorch in float32: of forces as a share of the label scale, of
@@ -164,13 +164,6 @@ def _traced(model: Model) -> tuple[EnsembleStep, tuple[torch.Tensor, ...]]:
     return step, (torch.zeros(1, 1, size, size), *step.zero_states())
 
 
-def inputs_of(model: Model, clip: Gray) -> Iterator[Floats]:
-    """Yields the network's inputs, (S, S) float32, for a recording (T, S, S) uint8, as in a run."""
-    normaliser = Normaliser(model.header.preprocess)
-    for frame in clip:
-        yield from normaliser.push(frame)
-
-
 def export_errors(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> ExportErrors:
     """Compares an exported file with PyTorch, on recordings, (T, S, S) uint8 each, or on noise.
 
@@ -187,7 +180,7 @@ def export_errors(model: Model, path: Path, frames: Sequence[Gray] | None = None
         frames = [np.random.default_rng(0).integers(0, 256, (_CHECKED, size, size), np.uint8)]
     made = Model(path, model.header, model.digest)
     expected, exported = (
-        [step for clip in frames for step in _steps(engine, model, clip)]
+        [step for clip in frames for step in stream(engine, clip)]
         for engine in (TorchEngine(model), open_engine(made, EXPORTED[path.suffix]))
     )
     for name in ("forces_n", "features", "attention"):
@@ -210,11 +203,6 @@ def export_errors(model: Model, path: Path, frames: Sequence[Gray] | None = None
         "mean_n": float(error_n.mean()),
         "rms_n": float(np.sqrt(np.square(error_n).mean())),
     }
-
-
-def _steps(engine: Engine, model: Model, clip: Gray) -> list[StepOutput]:
-    engine.reset()
-    return [engine.step(frame) for frame in inputs_of(model, clip)]
 
 
 @contextmanager

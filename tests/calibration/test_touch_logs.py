@@ -1,3 +1,4 @@
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -5,11 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gripper_calibration.touch_logs import join, read_log, touch_numbers
+from gripper_calibration.touch_logs import TouchRecording, join, read_log, touch_numbers
 from gripper_force.errors import DataError
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_S, Frame, LoadCellSample
-from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.engines.pytorch import TorchEngine
+from gripper_force.vision.model_files import read_model
+from gripper_force.vision.stream_inference import features
 
 
 @given(st.lists(st.tuples(st.integers(5, 40), st.integers(3, 40), st.floats(1, 12)), min_size=1, max_size=6))
@@ -39,25 +42,30 @@ def recording(path: Path, forces_n: list[float], *, keys: str = "object: mug") -
     return path
 
 
+def read(path: Path, checkpoint: Path) -> TouchRecording:
+    """Reads a log with the networks of a checkpoint."""
+    engine = TorchEngine(read_model(checkpoint))
+    return read_log(path, engine.header.preprocess, partial(features, engine))
+
+
 def test_join_refuses_logs_of_different_objects_or_load_cells(tmp_path: Path, tiny_checkpoint: Path) -> None:
-    checkpoint = load_checkpoint(tiny_checkpoint)
     forces_n = [0.0] * 10 + [2.0] * 20
-    mug = read_log(recording(tmp_path / "a.mcap", forces_n), checkpoint)
+    mug = read(recording(tmp_path / "a.mcap", forces_n), tiny_checkpoint)
     for keys, sentence in (
         ("object: cup", "object cup, and .*a.mcap with mug"),
         ("object: mug\nload_cell: {n_per_raw: 2.0}", r"load_cell\.n_per_raw 2.0"),
         ("object: mug\nload_cell: {backend: phidget}", "load cell phidget"),
     ):
-        other = read_log(recording(tmp_path / "b.mcap", forces_n, keys=keys), checkpoint)
+        other = read(recording(tmp_path / "b.mcap", forces_n, keys=keys), tiny_checkpoint)
         with pytest.raises(DataError, match=sentence):
             join({tmp_path / "a.mcap": mug, tmp_path / "b.mcap": other})
     retared = recording(tmp_path / "b.mcap", forces_n, keys="object: mug\nload_cell: {tare_raw: 2.0}")
-    both = join({tmp_path / "a.mcap": mug, retared: read_log(retared, checkpoint)})
+    both = join({tmp_path / "a.mcap": mug, retared: read(retared, tiny_checkpoint)})
     assert both.touches.numbers == [0, 1]
 
 
 def test_log_without_contact_has_no_lag(tmp_path: Path, tiny_checkpoint: Path) -> None:
-    recorded = read_log(recording(tmp_path / "a.mcap", [0.0] * 30), load_checkpoint(tiny_checkpoint))
+    recorded = read(recording(tmp_path / "a.mcap", [0.0] * 30), tiny_checkpoint)
     assert not recorded.has_contact
     assert recorded.delay_s == pytest.approx(0.02 + 1 / 60)
 
@@ -67,12 +75,12 @@ def test_log_without_labels_after_the_lead_in_is_refused(tmp_path: Path, tiny_ch
     with pytest.raises(
         DataError, match=r".* has no label after its first 3 frames, which the network needs as lead-in"
     ):
-        read_log(path, load_checkpoint(tiny_checkpoint))
+        read(path, tiny_checkpoint)
 
 
 def test_recording_without_a_servo_has_no_presses(tmp_path: Path, tiny_checkpoint: Path) -> None:
     path = recording(tmp_path / "clip.mcap", [max(0.0, 0.2 * (i - 10)) for i in range(40)])
-    recorded = read_log(path, load_checkpoint(tiny_checkpoint))
+    recorded = read(path, tiny_checkpoint)
     assert recorded.presses == []
     assert recorded.camera["camera.rate_hz"] == 30
     assert recorded.touches.numbers == [0]

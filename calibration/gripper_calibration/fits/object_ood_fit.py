@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from gripper_calibration.fits.touches import Floats, Touches
-from gripper_force.jobs.training.ood_fit import fit_subspace, smooth_ratios, typical_shares
+from gripper_force.jobs.known_frames import fit_subspace, smooth_ratios, typical_shares
 from gripper_force.profiles.correction import KnownFrames
 from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.vision.header import OodModel

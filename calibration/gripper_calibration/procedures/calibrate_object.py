@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Final
@@ -31,7 +32,8 @@ from gripper_force.jobs.trials import with_same_object
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
-from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.engines import open_engine
+from gripper_force.vision.stream_inference import features
 
 TOUCHES: Final = 8
 """Default number of touches: enough for an object of a kind that the network was not trained on."""
@@ -267,10 +269,12 @@ def _fit_and_write(
     config: Config, name: str, paths: Sequence[Path], out: Path, progress: Progress
 ) -> ObjectCalibration:
     config, model, _ = resolve_vision(config)
-    checkpoint = load_checkpoint(config.vision.checkpoint)
+    assert model is not None  # as checked before the touches
+    vision = config.vision
+    run = partial(features, open_engine(model, vision.engine, vision.precision, vision.threads))
     recordings = {}
     for path in sorted(paths, key=started_ns):  # the order shows after which touch the object stayed narrower
-        recordings[path] = read_log(path, checkpoint)
+        recordings[path] = read_log(path, model.header.preprocess, run)
         progress(path.name)
     with_reference = {path: one for path, one in recordings.items() if not one.starts_in_contact}
     if not with_reference:
@@ -281,7 +285,7 @@ def _fit_and_write(
     with_contact = {path: one for path, one in with_reference.items() if one.has_contact}
     recorded = join(with_contact or with_reference)  # without any contact, the fit reports the largest force
     touches = recorded.touches
-    fit = fit_correction(touches, COVERAGE, checkpoint.header.ood)
+    fit = fit_correction(touches, COVERAGE, model.header.ood)
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")

@@ -6,6 +6,7 @@ The best of the `teach_candidates` is trained on all touches, and calibrated.
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import sha256
 from itertools import islice
 from pathlib import Path
@@ -45,6 +46,7 @@ from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
 from gripper_force.types import Frame, LoadCellSample
+from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.estimator import claimed_std_n
@@ -243,7 +245,9 @@ def _taught(
     checkpoint = work.learned(chosen)
     progress(f"trained on all touches: {chosen.name}")
     learned = load_checkpoint(checkpoint)
-    recorded = join({path: read_log(path, learned) for path in sorted(work.logs, key=started_ns)})
+    preprocess = learned.header.preprocess
+    run = partial(features, learned.networks, preprocess)
+    recorded = join({path: read_log(path, preprocess, run) for path in sorted(work.logs, key=started_ns)})
     fit = _fit(recorded.touches, found)
     config = config.with_values(vision={"checkpoint": str(checkpoint)})
     profile, _ = make_profile(name, recorded, fit, ResolvedConfig(config, read_model(checkpoint)))

@@ -14,6 +14,7 @@ import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from itertools import combinations
 from pathlib import Path
@@ -42,6 +43,7 @@ from gripper_force.jobs.profile_files import write_all
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
 from gripper_force.progress import Progress
+from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.header import SHIPPED, GaussianProcessConfig, Model
 from gripper_force.vision.model_files import read_model
@@ -259,7 +261,8 @@ def _evaluate(task: _Task) -> None:
         file = task.file.with_suffix(f".{number}.safetensors")
         if task.candidate.recipe or not recorded:  # a network as it is sees the same in every split
             made = _make(task, split, file)
-            recorded = [read_log(path, made) for path in task.logs]
+            run = partial(features, made.networks, made.header.preprocess)
+            recorded = [read_log(path, made.header.preprocess, run) for path in task.logs]
         known = join({task.logs[i]: recorded[i] for i in split}).touches
         subspace = object_subspace(known)
         try:

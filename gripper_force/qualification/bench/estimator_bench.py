@@ -29,11 +29,11 @@ from gripper_force.qualification.proc_files import process_text
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
-from gripper_force.vision.export import inputs_of
 from gripper_force.vision.header import Model, NetworkConfig
 from gripper_force.vision.model_files import cache_folder, read_model
 from gripper_force.vision.selection import installed
 from gripper_force.vision.step_benchmark import EngineCandidate, cache_key, update_cache
+from gripper_force.vision.stream_inference import prepared, stream
 
 WINDOW: Final = "torch, window"
 """The paper's method: for each frame, the network processes the whole window before it."""
@@ -178,7 +178,7 @@ def _measure(
     progress: Progress,
 ) -> Iterator[EstimatorCost]:
     errors: dict[tuple[str, str], dict[str, float]] = {}
-    frames = list(inputs_of(model, clips[0].frames))
+    frames = list(prepared(clips[0].frames, model.header.preprocess))
     networks = [member for member in model.header.members if isinstance(member, NetworkConfig)]
     for count in threads:
         engines = {}
@@ -229,7 +229,7 @@ def _errors(engine: Engine, model: Model, clips: Sequence[Clip]) -> dict[str, fl
     estimates, measured = [], []
     for clip in clips:
         engine.reset()
-        forces_n = np.array([engine.step(frame).forces_n.mean() for frame in inputs_of(model, clip.frames)])
+        forces_n = np.array([step.forces_n.mean() for step in stream(engine, clip.frames)])
         use = clip.labelled(model.header.preprocess.lead_in)
         estimates.append(forces_n[use])
         measured.append(clip.forces_n[use])

@@ -44,11 +44,12 @@ from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats
 from gripper_force.vision.estimator import ForceEstimator
-from gripper_force.vision.export import TOLERANCE, inputs_of
+from gripper_force.vision.export import TOLERANCE
 from gripper_force.vision.header import RESIDUAL_HALF_N
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess, downscale
+from gripper_force.vision.stream_inference import prepared
 
 STREAMED: Final = 1_000_000
 """Frames of the longest stream, through a small network: 4.6 hours at 60 Hz."""
@@ -123,7 +124,8 @@ def _contact(grasp: Clip, size: int) -> Gray:
 
 
 def _inputs(reference: ReferenceEnsemble, grasp: Clip) -> Floats:
-    return np.stack(list(inputs_of(reference.model, _contact(grasp, reference.model.header.preprocess.size))))
+    preprocess = reference.model.header.preprocess
+    return np.stack(list(prepared(_contact(grasp, preprocess.size), preprocess)))
 
 
 def _run(engine: Engine, inputs: Floats) -> Float64Result:
@@ -387,7 +389,7 @@ def _starts(engine: Engine, frames: Gray) -> bool:
 
 
 def _prepare_float64(clip: Gray, preprocess: Preprocess) -> Float64Result:
-    """Prepared frames as by `inputs_of`, in float64, (T, S, S)."""
+    """Prepared frames as by `stream_inference.prepared`, in float64, (T, S, S)."""
     frames = clip.astype(np.float64)
     deviation = np.maximum(frames.std((1, 2), keepdims=True), FLAT_STD)
     standard: Float64Result = (frames - frames.mean((1, 2), keepdims=True)) / deviation
@@ -452,7 +454,7 @@ def _streams(
         f"memory over {streamed} frames", "growth after the first tenth", grown_mb, _LEAK_MB, "MB"
     )
     drift_n, _, _, last = _stream(
-        reference, variant, np.stack(list(inputs_of(reference.model, press.frames))), long
+        reference, variant, np.stack(list(prepared(press.frames, reference.model.header.preprocess))), long
     )
     bound_n = reference.bound_n(last, ROUNDING["float32"])
     yield NumericalCase(f"{long} frames, configured network", detail, drift_n, float(bound_n.max()), "N")

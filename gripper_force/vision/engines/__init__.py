@@ -56,6 +56,12 @@ class Engine(ABC):
         """Forgets all frames; the next one is the first of a new stream."""
         self._begun = False
 
+    def warm_up(self) -> None:
+        """Runs the networks once, so that the first step of a stream is as fast as the others."""
+        self._zero_states()
+        self._infer(np.zeros((self.header.preprocess.size,) * 2, np.float32))
+        self.reset()
+
     def step(self, frame: Floats) -> StepOutput:
         """Processes the next prepared frame of the stream.
 
@@ -112,6 +118,5 @@ def open_engine(
         raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
     other = "" if engine == "onnxruntime" else ", or set vision.engine=onnxruntime"
     opened: Engine = load_class("engines", ENGINES, engine, "vision.engine", other)(model, precision, threads)
-    opened.step(np.zeros((model.header.preprocess.size,) * 2, np.float32))
-    opened.reset()
+    opened.warm_up()
     return opened

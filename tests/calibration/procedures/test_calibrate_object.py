@@ -3,8 +3,10 @@
 import json
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +120,12 @@ def test_command_calibrates_from_one_touch(touched: list[Path], tmp_path: Path) 
     assert f"next: gripper-force {words}" in result.stderr
 
 
+def test_calibration_needs_no_pytorch() -> None:
+    code = "import sys, gripper_calibration.procedures.calibrate_object; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"torch", "gripper_force.vision.export"} & set(done.stdout.split())
+
+
 def test_log_is_read_once_with_the_results_of_separate_reads(
     touched: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,7 +151,7 @@ def test_log_is_read_once_with_the_results_of_separate_reads(
             return super().records(*types)
 
     monkeypatch.setattr(touch_logs, "LogReader", CountingReader)
-    recorded = touch_logs.read_log(path, checkpoint)
+    recorded = touch_logs.read_log(path, preprocess, partial(features, checkpoint.networks, preprocess))
     assert passes == [4]
     labelled = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
     forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)

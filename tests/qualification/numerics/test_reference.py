@@ -6,8 +6,8 @@ import torch
 
 from gripper_force.qualification.numerics.reference import ROUNDING, ReferenceEnsemble, Rounding
 from gripper_force.vision.batch_inference import predict
-from gripper_force.vision.export import inputs_of
 from gripper_force.vision.model_files import read_model
+from gripper_force.vision.stream_inference import prepared
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def test_float64_agrees_with_float32_up_to_rounding(reference: ReferenceEnsemble
     networks = [network.float() for network in reference.networks]
     expected = predict(networks, reference.model.header.preprocess, frames)
     again = ReferenceEnsemble(reference.model, Path())
-    found_n = again.forces_n(np.stack(list(inputs_of(reference.model, frames))))
+    found_n = again.forces_n(np.stack(list(prepared(frames, reference.model.header.preprocess))))
     assert 0 < np.abs(found_n - expected).max() < 1e-3 * np.abs(expected).max()
 
 
