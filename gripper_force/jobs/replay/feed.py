@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from gripper_force.config import Config, Overrides, config_from_text
-from gripper_force.control.state_machine import Decision
+from gripper_force.control.state_machine import Decision, GraspController
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.perception import FrameProcessor
@@ -129,59 +129,91 @@ class Agreement(NamedTuple):
 
 def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink) -> Agreement:
     """Runs estimator and controller on a log, as `run_again`. Keeps no record for longer than it is needed."""
-    config = resolved.config
-    is_faulty = has_faulty_estimates(config)
-    had_controller = config.gripper.nm_per_a is not None  # an imported recording had none
-    controller = make_controller(config) if had_controller else None
-    newest: VisualForce | None = None
-    request: Request | None = None
-    pending: dict[int, VisualForce | None] = {}
-    had_network = bool(reader.metadata.get("checkpoint"))
-    # NaN, of a covered view, does not equal itself.
-    estimates = _RecordMatcher(lambda v: (v.seq, None if math.isnan(v.force_n) else v.force_n, v.std_n))
-    commands = _RecordMatcher(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
-    fused = _RecordMatcher(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
-    status = _RecordMatcher(lambda s: s)
-    matcher_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
-    processor = FrameProcessor(make_estimator(resolved))
+    again = _Feed(reader, resolved, sink)
     for record in reader.records():
-        if isinstance(record, Frame):
-            if (estimate := processor.process(record).visual) is not None:
-                sink.add_visual(estimate)
-                estimates.add_replayed(estimate)
-                if not had_network:  # so the log has no time at which an estimate was ready
-                    newest = replace(estimate, ready_ns=record.received_ns)
-            pending[record.seq] = estimate
-            if len(pending) > _BACKLOG:
-                del pending[next(iter(pending))]
-            continue
-        if (matcher := matcher_of.get(type(record))) is not None:
+        again.take(record)
+    return again.agreement()
+
+
+class _Feed:
+    """Estimator and controller that take a log's records in their order, and the comparison with the log."""
+
+    def __init__(self, reader: LogReader, resolved: ResolvedConfig, sink: Sink) -> None:
+        config, self._sink = resolved.config, sink
+        self._processor = FrameProcessor(make_estimator(resolved))
+        had_controller = config.gripper.nm_per_a is not None  # an imported recording had none
+        self._controller = make_controller(config) if had_controller else None
+        self._is_faulty = has_faulty_estimates(config)
+        self._has_network = resolved.model is not None
+        self._had_network = bool(reader.metadata.get("checkpoint"))
+        self._newest: VisualForce | None = None
+        self._request: Request | None = None
+        self._pending: dict[
+            int, VisualForce | None
+        ] = {}  # by number of the frame, until the log's estimate comes
+        # NaN, of a covered view, does not equal itself.
+        self._estimates = _RecordMatcher(
+            lambda v: (v.seq, None if math.isnan(v.force_n) else v.force_n, v.std_n)
+        )
+        self._commands = _RecordMatcher(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
+        self._fused = _RecordMatcher(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
+        self._status = _RecordMatcher(lambda s: s)
+        self._matchers = {
+            VisualForce: self._estimates,
+            ServoCommand: self._commands,
+            FusedForce: self._fused,
+            GraspStatus: self._status,
+        }
+
+    def take(self, record: Record) -> None:
+        """Takes the log's next record."""
+        if (matcher := self._matchers.get(type(record))) is not None:
             matcher.add_logged(record)
-        if isinstance(record, VisualForce):
+        if isinstance(record, Frame):
+            self._estimate(record)
+        elif isinstance(record, VisualForce):
             # A log whose disk was slow lacks frames; only their estimates are the logged ones.
-            is_logged = is_faulty or (resolved.model is not None and record.seq not in pending)
-            again = record if is_logged else pending.pop(record.seq, None)
+            is_logged = self._is_faulty or (self._has_network and record.seq not in self._pending)
+            again = record if is_logged else self._pending.pop(record.seq, None)
             if again is not None:  # the time at which it was ready is the run's, not this computer's
-                newest = replace(again, ready_ns=record.ready_ns)
+                self._newest = replace(again, ready_ns=record.ready_ns)
         elif isinstance(record, Request):
-            request = record
-        elif isinstance(record, ServoState) and controller is not None:
-            decision = controller.step(record.t_ns, record, newest, request)
-            sink.add_decision(decision)
-            commands.add_replayed(decision.command)
-            fused.add_replayed(decision.estimate)
-            status.add_replayed(decision.status)
-            newest = request = None
+            self._request = record
+        elif isinstance(record, ServoState) and self._controller is not None:
+            self._decide(self._controller, record)
         elif isinstance(record, LoadCellSample):
-            sink.add_cell(record)
-    # The run may have ended before it used the estimates of its last frames, and the last cycle of a truncated log
-    # may be incomplete.
-    same_decisions = all(matcher.agree(extra=1) for matcher in (commands, fused, status))
-    return Agreement(
-        estimates.agree() if estimates.logged and not is_faulty else None,
-        same_decisions if commands.logged else None,
-        {"goal_current_a": commands.largest, "fused_n": fused.largest} if commands.logged else {},
-    )
+            self._sink.add_cell(record)
+
+    def _estimate(self, frame: Frame) -> None:
+        estimate = self._processor.process(frame).visual
+        if estimate is not None:
+            self._sink.add_visual(estimate)
+            self._estimates.add_replayed(estimate)
+            if not self._had_network:  # so the log has no time at which an estimate was ready
+                self._newest = replace(estimate, ready_ns=frame.received_ns)
+        self._pending[frame.seq] = estimate
+        if len(self._pending) > _BACKLOG:
+            del self._pending[next(iter(self._pending))]
+
+    def _decide(self, controller: GraspController, state: ServoState) -> None:
+        decision = controller.step(state.t_ns, state, self._newest, self._request)
+        self._newest = self._request = None
+        self._sink.add_decision(decision)
+        self._commands.add_replayed(decision.command)
+        self._fused.add_replayed(decision.estimate)
+        self._status.add_replayed(decision.status)
+
+    def agreement(self) -> Agreement:
+        """Returns the agreement of all records so far."""
+        estimates, commands = self._estimates, self._commands
+        # The run may have ended before it used the estimates of its last frames, and the last cycle of a truncated log
+        # may be incomplete.
+        same = all(matcher.agree(extra=1) for matcher in (commands, self._fused, self._status))
+        return Agreement(
+            estimates.agree() if estimates.logged and not self._is_faulty else None,
+            same if commands.logged else None,
+            {"goal_current_a": commands.largest, "fused_n": self._fused.largest} if commands.logged else {},
+        )
 
 
 _BACKLOG: Final = 1024
