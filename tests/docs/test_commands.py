@@ -7,6 +7,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +81,10 @@ BLOCKS = [line for page in PAGES for line in block_lines(page)]
 SENTENCES = [line for page in PAGES for line in inline_commands(page)]
 
 
-def parse(words: list[str]) -> Call:
-    """Parses a command without running it. Raises what the command line raises."""
-    calls = []
+@cache
+def recorder() -> tuple[Any, list[Call]]:
+    """The command line, whose commands note their call instead of running, and the notes. Making it takes time."""
+    calls: list[Call] = []
     root: Any = typer.main.get_command(cli.app)
 
     def record(command: Any, name: str) -> None:
@@ -93,6 +95,13 @@ def parse(words: list[str]) -> Call:
             command.callback = lambda **values: calls.append(Call(name, values))
 
     record(root, "")
+    return root, calls
+
+
+def parse(words: list[str]) -> Call:
+    """Parses a command without running it. Raises what the command line raises."""
+    root, calls = recorder()
+    calls.clear()
     root.main(words, standalone_mode=False)
     (call,) = calls
     return call
