@@ -289,13 +289,16 @@ def test_logs_of_two_cameras_are_refused(touched: list[Path], tmp_path: Path) ->
         record_touches(load_config(None, [*QUICK, "camera.exposure_us=3000"]), 1, 6.0, tmp_path / "other")
     )
     with pytest.raises(DataError, match="exposure_us 3000"):
-        calibrate_object(load_config(), "stapler", logs=[*touched, *other], out=tmp_path / "p.yaml")
+        calibrate_object(
+            load_config(None, QUICK), "stapler", logs=[*touched, *other], out=tmp_path / "p.yaml"
+        )
     assert not (tmp_path / "p.yaml").exists()
 
 
 def test_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "it.yaml"
     given = ["calibrate", "object", "stapler", "--from", str(touched[0].parent), "--out", str(out), "--json"]
+    given += ["--set", "vision.checkpoint=small"]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.stderr
     found = json.loads(result.stdout)
@@ -313,6 +316,7 @@ def test_logs_that_start_in_contact_are_left_out_with_a_warning(touched: list[Pa
             if record.t_ns >= pressed_ns:
                 log.write(record)
     given = ["calibrate", "object", "stapler", "--out", str(tmp_path / "it.yaml"), "--json", "--from"]
+    given[-1:-1] = ["--set", "vision.checkpoint=small"]
     result = CliRunner().invoke(app, [*given, str(cut), "--from", str(touched[0].parent)])
     assert result.exit_code == 0, result.stderr
     assert "left out 1 logs starting in contact: cut.mcap" in result.stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gripper_calibration.setup.rig_file import RigFile, flat
-from gripper_calibration.setup.run import STEPS, Setup
+from gripper_calibration.setup.run import STEPS, Setup, StepReport
 from gripper_calibration.setup.step import ANSWERED, Found
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
@@ -79,9 +79,17 @@ def test_a_setup_without_a_load_cell_ends_with_a_rig_file_and_continues_there(tm
     assert load_config(path).camera.exposure_us == 3000
 
 
-def test_a_known_mass_takes_the_place_of_a_load_cell(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    reports = list(Setup(path, SIMULATED, mass_kg=0.5).run(script := Script()))
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[StepReport], Script]:
+    """A rig file of all steps with a known mass, what the steps reported, and what a person was told."""
+    path, script = tmp_path_factory.mktemp("finished") / "rig.yaml", Script()
+    return path, list(Setup(path, SIMULATED, mass_kg=0.5).run(script)), script
+
+
+def test_a_known_mass_takes_the_place_of_a_load_cell(
+    finished: tuple[Path, list[StepReport], Script],
+) -> None:
+    path, reports, script = finished
     assert any("Hang 0.5 kg" in text for text in script.told)
     config = load_config(path)
     true = load_model(config.servo.model).nm_per_a * draw_scene("none", config.seed, config.sim).nm_per_a
@@ -149,10 +157,9 @@ def test_a_place_that_can_not_be_written_is_named_before_the_servo_is_changed(
 
 
 def test_a_finished_setup_is_shown_from_a_place_that_can_not_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished: tuple[Path, list[StepReport], Script], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "rig.yaml"
-    list(Setup(path, SIMULATED).run(Script()))
+    path, *_ = finished
 
     def refuse(_: RigFile) -> None:
         raise ConfigError("can't write")
