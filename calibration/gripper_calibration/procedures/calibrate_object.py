@@ -23,6 +23,7 @@ from gripper_calibration.fits.plant_fit import crushing_touch, fit_plant, stiffn
 from gripper_calibration.plots.object_plot import draw
 from gripper_calibration.procedures.estimate_time import estimate_ms
 from gripper_calibration.touch_logs import TouchRecording, join, read_log, started_ns
+from gripper_force import __version__
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import find_logs
@@ -289,7 +290,8 @@ def _fit_and_write(
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")
-    profile, crushed_at_n = make_profile(name, recorded, fit, ResolvedConfig(config, model))
+    used = [digest_of(path) for path in with_contact or with_reference]
+    profile, crushed_at_n = make_profile(name, recorded, fit, ResolvedConfig(config, model), used)
     write_object(out, profile, pack(fit.arrays))
     report = out.with_suffix(".png")
     draw(profile, fit, touches, curve, report)
@@ -309,8 +311,13 @@ def _fit_and_write(
     )
 
 
+def digest_of(path: Path) -> str:
+    """Returns the SHA-256 of a file."""
+    return sha256(path.read_bytes()).hexdigest()
+
+
 def make_profile(
-    name: str, recorded: TouchRecording, fit: ObjectFit, resolved: ResolvedConfig
+    name: str, recorded: TouchRecording, fit: ObjectFit, resolved: ResolvedConfig, logs: Sequence[str]
 ) -> tuple[ObjectProfile, float | None]:
     """Makes an object profile of a fit.
 
@@ -319,6 +326,7 @@ def make_profile(
         recorded: The touches that it was fitted to.
         fit: The fit.
         resolved: Configuration, and the network.
+        logs: SHA-256 of each log of the touches.
 
     Returns:
         The profile, and the largest force of the touch after which the object stayed narrower, or None.
@@ -347,6 +355,8 @@ def make_profile(
         before_n=fit.before_n,
         after_n=fit.after_n,
         weights=sha256(pack(fit.arrays)).hexdigest(),
+        logs=tuple(logs),
+        version=__version__,
     )
     return profile, None if crushed is None else float(peaks_n[crushed])
 

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 from typing import Final
@@ -21,7 +20,12 @@ from gripper_calibration.fits.object_fit import COVERAGE, ObjectFit, fit_correct
 from gripper_calibration.fits.object_ood_fit import left_out_shares, object_limits, object_subspace
 from gripper_calibration.fits.touches import Touches
 from gripper_calibration.plots.taught_plot import draw
-from gripper_calibration.procedures.calibrate_object import default_folder, make_profile, record_touches
+from gripper_calibration.procedures.calibrate_object import (
+    default_folder,
+    digest_of,
+    make_profile,
+    record_touches,
+)
 from gripper_calibration.procedures.teach_candidates import (
     FOLDS,
     Candidate,
@@ -32,7 +36,6 @@ from gripper_calibration.procedures.teach_candidates import (
     make_candidates,
 )
 from gripper_calibration.touch_logs import join, read_log, started_ns
-from gripper_force import __version__
 from gripper_force.config import Config, config_from_text
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import CONTACT_N, StreamedClip, find_logs, load_clips, starts_in_contact
@@ -174,9 +177,9 @@ def teach(
         paths = find_logs(logs)
     used, without_contact, contact_starts = _sorted_by_contact(paths, model)
     # The same touch in two folds would be both learned and left out.
-    logs_by_digest = {_digest_of(path): path for path in used}
+    logs_by_digest = {digest_of(path): path for path in used}
     # A touch that is replayed would be learned where it is left out.
-    replayed = {} if not replay else {_digest_of(path): path for path in find_logs(replay)}
+    replayed = {} if not replay else {digest_of(path): path for path in find_logs(replay)}
     others = {digest: path for digest, path in replayed.items() if digest not in logs_by_digest}
     in_contact = [path for path in others.values() if _starts_in_contact(path, model.header.preprocess)]
     others = {digest: path for digest, path in others.items() if path not in in_contact}
@@ -250,8 +253,9 @@ def _taught(
     recorded = join({path: read_log(path, preprocess, run) for path in sorted(work.logs, key=started_ns)})
     fit = _fit(recorded.touches, found)
     config = config.with_values(vision={"checkpoint": str(checkpoint)})
-    profile, _ = make_profile(name, recorded, fit, ResolvedConfig(config, read_model(checkpoint)))
-    origin = {"network": _NETWORK, "logs": work.digests, "version": __version__, "file": _object_file(config)}
+    resolved = ResolvedConfig(config, read_model(checkpoint))
+    profile, _ = make_profile(name, recorded, fit, resolved, work.digests)
+    origin = {"network": _NETWORK, "file": _object_file(config)}
     progress("calibrated")
     error_n = found.absolute_error_n
     taught = Taught(
@@ -325,10 +329,6 @@ def _starts_in_contact(path: Path, preprocess: Preprocess) -> bool:
     if not is_whole:  # the labels may come later in the log, or never
         (clip,) = load_clips([path], preprocess)
     return starts_in_contact(clip.forces_n, preprocess)
-
-
-def _digest_of(path: Path) -> str:
-    return sha256(path.read_bytes()).hexdigest()
 
 
 def _stated(header: Header, candidate: Candidate, known: KnownFrames, left: Sequence[LeftOut]) -> Header:

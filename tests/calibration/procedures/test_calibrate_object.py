@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from typer.testing import CliRunner, Result
 from gripper_calibration import touch_logs
 from gripper_calibration.procedures import calibrate_object as job
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
+from gripper_force import __version__
 from gripper_force.cli import app, console
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.control.transmission import Transmission
@@ -94,6 +96,9 @@ def test_missing_touches_are_recorded_and_then_fitted(touched: list[Path], tmp_p
         out=str(tmp_path / "same.yaml"),
     )
     assert result.profile.weights == same.profile.weights
+    assert result.profile.version == __version__
+    digests = [sha256(path.read_bytes()).hexdigest() for path in sorted(tmp_path.glob("*.mcap"))]
+    assert list(result.profile.logs) == digests
     assert result.profile == read_object(result.profile_path)
     assert result.mae_after_n is None
     assert result.mae_before_n == result.as_dict()["before_n"]
