@@ -38,9 +38,7 @@ _MAX_CHUNK: Final = 1 << 28
 _DAMAGE: Final = (McapError, DecodeError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 """Exceptions of the decoders on damaged bytes."""
 
-_REMEDY: Final = (
-    "read what is whole with `gripper-force replay LOG --recover`, and leave this log out elsewhere"
-)
+_REMEDY: Final = "read the rest with `gripper-force replay LOG --recover`, and leave this log out elsewhere"
 
 A = TypeVar("A", bound=Record)
 B = TypeVar("B", bound=Record)
@@ -91,11 +89,11 @@ class LogReader:
                 self._scan(file)
         except OSError as error:
             raise LogError(f"can't read the log {path}: {error.strerror}; check the path") from error
+        if CONFIG_NAME not in self.attachments:
+            why = "holds no configuration" if self.complete else "is empty, or damaged at its start"
+            raise LogError(f"{path} {why}, so it can't be used; leave it out")
         if not (self.complete or recover):
             raise LogError(self._describe_loss())
-        if CONFIG_NAME not in self.attachments:
-            why = "it holds no configuration" if self.complete else "it is cut before its configuration"
-            raise LogError(f"{path} can't be used: {why}, so gripper-force did not write it whole")
         self.config = self.attachments[CONFIG_NAME].decode(errors="replace")
 
     @property
@@ -229,9 +227,7 @@ class LogReader:
     def _describe_loss(self) -> str:
         self._recover = True
         readable = f"{sum(1 for _ in self.records())} records ({self.duration_ns / NS_PER_S:.2f} s)"
-        return (
-            f"{self.path} is cut short, damaged or not finished yet: {readable} can be recovered; {_REMEDY}"
-        )
+        return f"{self.path} is cut short, damaged or not finished yet: {readable} are left; {_REMEDY}"
 
 
 def _checked(chunk: Chunk) -> Chunk:
