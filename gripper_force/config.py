@@ -657,18 +657,14 @@ class Config(Section):
     @model_validator(mode="after")
     def _check_sections(self) -> Self:
         if (open_m := self.gripper.open_width_m) <= self.control.min_object_width_m:
-            raise ValueError(
-                f"control.min_object_width_m must be below gripper.open_width_m {open_m:g} (metres)"
-            )
+            raise ValueError(f"control.min_object_width_m must be below gripper.open_width_m, {open_m:g} m")
         if self.gripper.linkage.kind == "finger" and len(self.servo.ids) > 1:
             raise ValueError(
                 "gripper.linkage.kind=finger has one moving finger, but servo.second.id names the servo of a "
                 "second one; set the kind to fingers"
             )
         if strange := {fault.id for fault in self.faults} - {None, *self.servo.ids}:
-            raise ValueError(
-                f"a fault has the id {strange.pop()}, but no servo of the gripper has it; correct it"
-            )
+            raise ValueError(f"a fault has the id {strange.pop()}, but no servo has it; correct it")
         return self
 
     @property

@@ -170,10 +170,8 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
 def differences(known: Tree, run: Tree) -> list[str]:
     """Describes the keys in which a run differs, as text. Missing keys, and lengths within 5 %, do not differ."""
     pairs = [(key, value, run[key]) for key, value in known.items() if key in run and run[key] != value]
-    lengths = [
-        isinstance(a, float) and isinstance(b, float) and isclose(a, b, rel_tol=0.05) for _, a, b in pairs
-    ]
-    return [f"{key} {a}, not {b}" for (key, a, b), same in zip(pairs, lengths, strict=True) if not same]
+    near = [type(a) is type(b) is float and isclose(a, b, rel_tol=0.05) for _, a, b in pairs]
+    return [f"{key} {a}, not {b}" for (key, a, b), same in zip(pairs, near, strict=True) if not same]
 
 
 def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldInfo]]:
@@ -199,8 +197,8 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         names = [key.value for key, _ in node.value]
         for i, (key, _) in enumerate(node.value):
             if key.value in names[:i] and key.value != "<<":
-                problem = f"the key {key.value!r} occurs twice; join its two parts"
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                line = key.start_mark.line + 1
+                raise ValueError(f"line {line}: the key {key.value!r} occurs twice; join its two parts")
         return dict(super().construct_mapping(node, deep))
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
@@ -218,7 +216,16 @@ def _parse(text: str, what_fails: str) -> Any:
     try:
         return yaml.load(text, _Loader)  # noqa: S506  # it is a safe loader
     except _NO_YAML as error:
-        raise ConfigError(f"{what_fails}: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{what_fails}: {_reason(error, text)}") from error
+
+
+def _reason(error: Exception, text: str) -> str:
+    """Returns why the parser failed on a text, with the line."""
+    if not isinstance(error, yaml.MarkedYAMLError) or (mark := error.problem_mark) is None:
+        return " ".join(str(error).split())
+    if re.match(rf"(.*\n){{{mark.line}}} *\t", text):
+        return f"line {mark.line + 1} is indented with a tab; use spaces"
+    return f"line {mark.line + 1}: {error.problem}; check indentation, quotes and brackets up to there"
 
 
 def _sentence(root: type[Section], error: ValidationError, where: str, what: str) -> str:
@@ -234,16 +241,16 @@ def _sentence(root: type[Section], error: ValidationError, where: str, what: str
     reason = first["msg"].removeprefix("Value error, ")
     if not parts:
         return f"the {what} (from {where}) is inconsistent: {reason}"
+    if first["type"] == "model_type":
+        return f"{what} key {key!r} (from {where}) is a section, got {first['input']!r}; write keys below it"
     return f"{what} key {key!r} (from {where}): {reason}, got {first['input']!r}"
 
 
 def _suggestion(root: type[Section], parts: list[str]) -> str:
     """Names the most similar known key path: first in the same section, then in all sections."""
     prefix = "".join(f"{part}." for part in parts[:-1])
-    here = [
-        f"{prefix}{name}"
-        for name in get_close_matches(parts[-1], list(_section_at(root, parts[:-1]).model_fields), 1)
-    ]
+    known = list(_section_at(root, parts[:-1]).model_fields)
+    here = [f"{prefix}{name}" for name in get_close_matches(parts[-1], known, 1)]
     paths = [path for path, _ in keys(root)]
     same_leaf = [path for path in paths if path.rpartition(".")[2] == parts[-1]]
     close = here or same_leaf or get_close_matches(".".join(parts), paths, 1)

@@ -103,7 +103,7 @@ def test_a_value_out_of_range_is_refused_with_its_key_and_itself(assignment: str
     [
         (
             "control.min_object_width_m=2",
-            "control.min_object_width_m must be below gripper.open_width_m 0.092",
+            "control.min_object_width_m must be below gripper.open_width_m, 0.092 m",
         ),
         ("control.settle_s=8", "settle_s 8 must be below timeout_s 8"),
         ("control.approach_force_n=20", "approach_force_n 20 must be below force_limit_n 14"),
@@ -172,7 +172,14 @@ def test_an_assignment_that_is_none_is_refused(tmp_path: Path, assignment: str, 
     ("data", "sentence"),
     [
         (b"- a\n- b\n", "must hold a mapping at its top level"),
-        (b"a: [1\n", "can't read the configuration"),
+        (
+            b"a: [1\n",
+            "can't read the configuration .*: line 2: .*; check indentation, quotes and brackets up to there",
+        ),
+        (b"control:\n\trate_hz: 100\n", "line 2 is indented with a tab; use spaces"),
+        (b"control:\n  rate_hz: 100\n \thold_s: 2\n", "line 3 is indented with a tab; use spaces"),
+        (b"control:\n  rate_hz: 1\n  rate_hz: 2\n", "line 3: the key 'rate_hz' occurs twice"),
+        (b"seed: 1\ncontrol:\n", "'control' .* is a section, got None; write keys below it"),
         (b"a: !!timestamp 2001-99-99", "month must be"),
         (b"a: " + b"[" * 2000, "can't read the configuration .*(recursion|nesting)"),
         (b"\xff\xfe\x00", "can't read the configuration"),

@@ -76,7 +76,7 @@ def test_a_key_that_occurs_twice_is_refused(tmp_path: Path) -> None:
     """The first section would be lost, and with it a force limit."""
     path = tmp_path / "rig.yaml"
     path.write_text("control: {force_limit_n: 8}\ncamera: {}\ncontrol: {hold_s: 3}\n")
-    with pytest.raises(ConfigError, match=r"the key 'control' occurs twice; join its two parts.*line 3"):
+    with pytest.raises(ConfigError, match=r"line 3: the key 'control' occurs twice; join its two parts"):
         load_config(path)
     path.write_text("a: &base {x: 1}\nb: {<<: *base, x: 2}\n")
     assert read_tree(path)["b"] == {"x": 2}
