@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gripper_force.errors import ConfigError
+
 if TYPE_CHECKING:  # --help needs no configuration
     from gripper_force.config import Config
 
@@ -74,4 +76,10 @@ def _load(
     from gripper_force.config import load_config
 
     given = [(key, value) for key, value in options.items() if value is not None]
-    return load_config(path, [*(overrides or []), *given], new_rig=new_rig)
+    try:
+        return load_config(path, [*(overrides or []), *given], new_rig=new_rig)
+    except ConfigError as error:
+        load_config(path, overrides, new_rig=new_rig)  # raises if the command's own options are not to blame
+        wrong = [key for key, _ in given if repr(key) in str(error)] or [key for key, _ in given]
+        names = ", ".join("--" + key.rpartition(".")[2].replace("_", "-") for key in wrong)
+        raise ConfigError(str(error).replace("(from --set)", f"(from {names})")) from None

@@ -764,8 +764,22 @@ def test_a_figure_that_is_no_number_is_null() -> None:
 def test_options_win_over_overrides() -> None:
     config = load_settings(None, ["seed=3", "object=tube"], {"seed": 4, "object": None})
     assert (config.seed, config.object) == (4, "tube")
-    with pytest.raises(ConfigError, match="configuration key 'target_n'"):
-        load_settings(None, None, {"target_n": -1.0})
+
+
+@pytest.mark.parametrize(
+    ("set_", "options", "sentence"),
+    [
+        (None, {"target_n": -1.0}, r"'target_n' \(from --target-n\)"),
+        (["target_n=2"], {"seed": -1, "target_n": 3.0}, r"'seed' \(from --seed\)"),
+        (["seed=-1"], {"target_n": 3.0}, r"'seed' \(from --set\)"),
+        (None, {"control.feedback": "sight"}, r"'control\.feedback' \(from --feedback\)"),
+    ],
+)
+def test_an_error_names_the_option_that_is_wrong(
+    set_: list[str] | None, options: dict[str, object], sentence: str
+) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        load_settings(None, set_, options)
 
 
 def test_a_path_that_cannot_be_used_is_one_sentence(run: Run) -> None:
