@@ -507,7 +507,7 @@ def _touches(
 
     paths: list[Path] = []
     with console.bar("touching", touches) as progress:
-        prompt = console.prompt(False, progress) if pause else None
+        prompt = console.prompt(False, progress, "leave out --pause") if pause else None
         try:
             for path in job.record_touches(
                 settings, touches, peak_n, folder, prompt=prompt, progress=progress

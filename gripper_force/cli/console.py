@@ -100,8 +100,16 @@ def tell_kept(what: str, *, fresh: bool) -> None:
     err.print(f"{what}; {same} continues there", soft_wrap=True, markup=False)
 
 
-def prompt(yes: bool, status: "Status | Bar | None" = None) -> "Prompt":
-    """Returns a prompt that waits for Enter, or with ``yes`` only prints. Meanwhile ``status`` is hidden."""
+def prompt(
+    yes: bool, status: "Status | Bar | None" = None, without: str = "if it is done, pass --yes"
+) -> "Prompt":
+    """Returns a prompt that waits for Enter, or with ``yes`` only prints. Meanwhile ``status`` is hidden.
+
+    Args:
+        yes: True to only print.
+        status: What to hide.
+        without: What to do if there is no terminal, for the error.
+    """
 
     def ask(text: str) -> None:
         if yes:
@@ -109,8 +117,7 @@ def prompt(yes: bool, status: "Status | Bar | None" = None) -> "Prompt":
             return
         if not sys.stdin.isatty():
             raise ConfigError(
-                f"this needs a person at a terminal: {text}; run it in a terminal or, if it is done, pass --yes or "
-                "leave out --pause"
+                f"this needs a person at a terminal: {text}; run it in a terminal or, {without}"
             )
         if status is not None:
             status.stop()

@@ -14,10 +14,15 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.profile_files import rig_to_update, update_rig
 from gripper_force.profiles.rig_profile import CalibratedValue, RigProfile, ServoCalibration
 from gripper_force.progress import Progress, Prompt, no_progress
+from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.resolve import resolve
 
 PLAUSIBLE_RATIO: Final = 1.4
 """Largest ratio between the measured and the expected torque constant, either way; see gripper.gain_bound."""
+
+SIM_GAUGE: Final = "block"
+SIM_GAUGE_MM: Final = 30.0
+"""The simulated object that stands for a load cell's rigid body, and its width."""
 
 _NOTED_SHIFT_M: Final = 0.003
 """Change of the widths that a person should hear of."""
@@ -83,8 +88,8 @@ def calibrate_servo(
         progress: Called with the step and the force a few times per second.
 
     Raises:
-        ConfigError: There is no load cell, a gauge does not fit, there are two servos, or the profile can't be read
-            or written.
+        ConfigError: There is no load cell, a gauge does not fit or is no gauge, there are two servos,
+            or the profile can't be read or written.
         DeviceError: A device failed, or the jaws start outside their travel. The servo has no torque.
         DataError: The jaws met nothing, or the readings are not sufficient for a calibration.
     """
@@ -104,6 +109,11 @@ def calibrate_servo(
                 f"a gauge of {1e3 * width_m:g} mm does not fit between jaws that open to "
                 f"{1e3 * config.gripper.open_width_m:g} mm (gripper.open_width_m); use a narrower one"
             )
+    if is_simulated(config) and config.sim.object is None and config.object != SIM_GAUGE:
+        raise ConfigError(
+            f"calibrate servo presses a rigid gauge, but the simulated object is {config.object!r}; pass --set "
+            f"object={SIM_GAUGE} --gauge-mm {SIM_GAUGE_MM:g}"
+        )
     known = rig_to_update(rig)
     given = Nominal(
         reference_m_per_rad(config.gripper), config.gripper.open_width_m, _scale_share(known, config, rig)

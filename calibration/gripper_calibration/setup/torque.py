@@ -4,7 +4,7 @@ import math
 from datetime import date
 from typing import Any, Final
 
-from gripper_calibration.procedures.calibrate_servo import calibrate_servo
+from gripper_calibration.procedures.calibrate_servo import SIM_GAUGE, SIM_GAUGE_MM, calibrate_servo
 from gripper_calibration.procedures.calibrate_weight import calibrate_weight, masses_kg
 from gripper_calibration.setup.load_cell import PROFILE, interval
 from gripper_calibration.setup.step import Found, StepResult, Task
@@ -13,10 +13,6 @@ from gripper_force.errors import ConfigError
 from gripper_force.profiles.rig_profile import FRICTION_DRIFT, NORMAL, RigProfile
 from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.resolve import resolve
-
-_SIM_GAUGE_MM: Final = 30.0
-_SIM_GAUGE: Final = "block"
-"""The simulated object that stands for a load cell's rigid body."""
 
 _FORCES_N: Final = (2.0, 4.0, 8.0)
 
@@ -49,9 +45,9 @@ def torque(task: Task) -> StepResult:
     simulated = is_simulated(config)
     gauge_mm = task.gauge_mm
     if gauge_mm is None:
-        default = _SIM_GAUGE_MM if simulated else None
+        default = SIM_GAUGE_MM if simulated else None
         gauge_mm = task.number("Width of the load cell between the jaws in mm", "--gauge-mm MM", default)
-    pressed = config.with_values(object=_SIM_GAUGE) if simulated else config
+    pressed = config.with_values(object=SIM_GAUGE) if simulated else config
     found = calibrate_servo(
         pressed, [1e-3 * gauge_mm], task.folder / PROFILE, prompt=task.person.do, progress=task.progress
     )

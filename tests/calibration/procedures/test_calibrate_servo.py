@@ -122,6 +122,7 @@ def test_profile_of_another_servo_is_refused_or_reported(rig: Path, tmp_path: Pa
     [
         (["load_cell.backend=none"], 0.03, ConfigError, "calibrate servo needs a load cell"),
         ([], 0.09, ConfigError, "a gauge of 90 mm does not fit between jaws that open to 92 mm"),
+        (["object=sponge"], 0.03, ConfigError, "object is 'sponge'; pass --set object=block --gauge-mm 30"),
         ([], 0.06, DataError, "the jaws met the gauge of 60 mm at a width of 30 mm"),
         (["faults=[{unit: load_cell, kind: 'off'}]"], 0.03, DataError, "no valid sample for 5 s"),
         (["faults=[{unit: load_cell, kind: wrong}]"], 0.03, DataError, "no valid sample for 5 s"),
@@ -320,3 +321,4 @@ def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:
     end = CliRunner().invoke(app, arguments)
     assert isinstance(end.exception, ConfigError)
     assert "this needs a person at a terminal: Put the load cell" in str(end.exception)
+    assert str(end.exception).endswith("if it is done, pass --yes")
