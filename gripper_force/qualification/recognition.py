@@ -208,12 +208,16 @@ def measure(
     tasks = [(row, index) for row in range(len(ROWS)) for index in range(presses)]
     tree = config.model_dump(mode="json")
     parts: dict[tuple[int, int], Tree] = {}
+    # Rows with the same scene share a log. The first task of each makes it; two at a time would both make it.
+    first = {(ROWS[row].settings, ROWS[row].objects, index): (row, index) for row, index in reversed(tasks)}
+    making = sorted(first.values())
     with process_pool(workers) as pool:
-        futures = {pool.submit(_press, row, index, folder, tree): (row, index) for row, index in tasks}
-        for future in as_completed(futures):
-            row, index = futures[future]
-            parts[row, index] = future.result()
-            progress(f"{ROWS[row].name} {index + 1}")
+        for wave in (making, [task for task in tasks if task not in making]):
+            futures = {pool.submit(_press, *task, folder, tree): task for task in wave}
+            for future in as_completed(futures):
+                row, index = futures[future]
+                parts[row, index] = future.result()
+                progress(f"{ROWS[row].name} {index + 1}")
     return [_figures(ROWS[row], [parts[row, index] for index in range(presses)]) for row in range(len(ROWS))]
 
 

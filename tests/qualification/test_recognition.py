@@ -1,6 +1,7 @@
 """`bench recognition` on one simulated press."""
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from gripper_force.config import load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification import recognition
+from gripper_force.schema import Tree
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
 
@@ -55,6 +57,27 @@ def test_a_covered_view_is_rejected_and_an_existing_press_is_used_again(
     error = CliRunner().invoke(cli.app, command).exception
     assert isinstance(error, DataError)
     assert "delete it" in str(error)
+
+
+def test_rows_with_the_same_scene_make_its_log_once_with_several_workers(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, thread_pool: object
+) -> None:
+    running: set[tuple[object, ...]] = set()
+    made: set[tuple[object, ...]] = set()
+
+    def make(row: int, index: int, _folder: Path, _tree: Tree) -> Tree:
+        log = (recognition.ROWS[row].settings, recognition.ROWS[row].objects, index)
+        assert log in made or log not in running, "two workers make one log"
+        running.add(log)
+        time.sleep(0.01)
+        made.add(log)
+        return {"force_n": [1.0], "estimate_n": [1.0], "std_n": [1.0], "rejected": [False]}
+
+    monkeypatch.setattr(recognition, "process_pool", thread_pool)
+    monkeypatch.setattr(recognition, "_press", make)
+    rows = recognition.measure(load_config(), tmp_path, 2, 8)
+    assert [row["name"] for row in rows] == [row.name for row in recognition.ROWS]
+    assert all(row["frames"] == 2 for row in rows)
 
 
 def test_frames_are_judged_as_in_a_run(press: Callable[..., Clip], tiny_checkpoint: Path) -> None:
