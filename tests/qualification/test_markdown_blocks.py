@@ -29,10 +29,15 @@ def test_an_interruption_leaves_the_page_as_it_was(tmp_path: Path, monkeypatch: 
     assert page.read_text() == before
 
 
-@pytest.mark.parametrize("text", [None, "", "<!-- here -->", "<!-- end of here --> <!-- here -->"])
-def test_a_page_without_the_lines_raises(text: str | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["", "<!-- here -->", "<!-- end of here --> <!-- here -->"])
+def test_a_page_without_the_lines_raises(text: str, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    if text is not None:
-        page.write_text(text)
+    page.write_text(text)
     with pytest.raises(DataError, match="it needs one line"):
         write_between(page, "here", "new")
+
+
+def test_a_page_that_can_not_be_read_is_no_page_without_the_lines(tmp_path: Path) -> None:
+    for path, reason in ((tmp_path / "none.md", "No such file or directory"), (tmp_path, "Is a directory")):
+        with pytest.raises(DataError, match=rf"can't write into .*: {reason}; check the path"):
+            write_between(path, "here", "new")
