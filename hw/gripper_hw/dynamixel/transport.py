@@ -280,5 +280,5 @@ def _check_result(description: str, result: int, error: int) -> int:
         return result
     if number == Error.CRC:
         return int(COMM_RX_CORRUPT)  # the request was corrupted on the bus: retry
-    name = Error(number).name.lower().replace("_", " ") if number in list(Error) else str(number)
-    raise DeviceError(f"{description} was refused ({name} error); power-cycle the servo and start again")
+    name = Error(number).name.lower().replace("_", " ") if number in list(Error) else "unknown"
+    raise DeviceError(f"{description} was refused: error {number} ({name}); power-cycle the servo")

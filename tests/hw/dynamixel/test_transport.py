@@ -118,7 +118,7 @@ def test_late_reply_is_not_used_for_the_next_request():
 def test_refusal_names_the_error(opened):
     endpoint, transport = opened
     endpoint.bus.servos[0].set("bus_watchdog", -1)
-    with pytest.raises(DeviceError, match="data range error"):
+    with pytest.raises(DeviceError, match=r"was refused: error 4 \(data range\); power-cycle"):
         transport.set(1, "goal_current", 1)
 
 
