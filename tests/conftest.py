@@ -21,6 +21,7 @@ from gripper_force.runtime import process
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
+from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
 
 # A shell that runs the tests in the background, or nohup, makes every process ignore these signals; tests send them.
 for _number, _handler in (
@@ -247,3 +248,10 @@ def _write_log(clip: Clip, folder: Path) -> Path:
             log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))
             log.write(LoadCellSample(i * 20 * NS_PER_MS, force_n, force_n, True))
     return path
+
+
+@pytest.fixture
+def server() -> Iterator[PtyServer]:
+    """A virtual servo behind a pseudo-terminal."""
+    with serve_virtual_servo("XM430-W350") as served:
+        yield served

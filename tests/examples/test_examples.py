@@ -4,21 +4,14 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
 
-from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
+from gripper_hw.dynamixel.pty_server import PtyServer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture
-def server() -> Iterator[PtyServer]:
-    with serve_virtual_servo("XM430-W350") as served:
-        yield served
 
 
 @pytest.fixture

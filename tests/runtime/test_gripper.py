@@ -26,7 +26,7 @@ from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.session import Session
 from gripper_hw.dynamixel.packets import Instruction, Parser
-from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
+from gripper_hw.dynamixel.pty_server import PtyServer
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, unregister_bus
 from gripper_hw.sim import simulated_rig as rig
 
@@ -45,12 +45,6 @@ def simulated(quick: list[str]) -> Iterator[Open]:
     yield make
     for gripper in opened:
         gripper.close()
-
-
-@pytest.fixture
-def server() -> Iterator[PtyServer]:
-    with serve_virtual_servo("XM430-W350") as served:
-        yield served
 
 
 @pytest.fixture
