@@ -5,6 +5,7 @@ against the finest level.
 """
 
 from collections.abc import Callable
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -61,9 +62,11 @@ def build_object(
         return OBJECTS[name](detail, size, stiffness)
     if name in (kinds := load_kinds()):
         return kinds[name].build(detail, size, stiffness)
+    known = [*OBJECTS, *kinds, NO_OBJECT]
+    hint = "".join(f"; did you mean {close!r}?" for close in get_close_matches(name.lower(), known, 1, 0.7))
     raise ConfigError(
-        f"no simulated object {name!r}; there are {', '.join([*OBJECTS, *kinds, NO_OBJECT])}, or the path of a file "
-        "of your own that ends in .yaml or .xml"
+        f"no simulated object {name!r}{hint}; there are {', '.join(known)}, or the path of a file of your own that "
+        "ends in .yaml or .xml"
     )
 
 
