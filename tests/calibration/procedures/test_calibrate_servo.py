@@ -317,7 +317,8 @@ def test_a_rig_profile_that_can_not_be_written_is_named_before_anything_happens(
 
 
 def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:
-    arguments: list[Any] = ["calibrate", "servo", "--gauge-mm", "30", "--rig", str(tmp_path / "rig.yaml")]
+    arguments: list[Any] = ["calibrate", "servo", "--gauge-mm", "30", "--set", "object=block"]
+    arguments += ["--rig", str(tmp_path / "rig.yaml")]
     end = CliRunner().invoke(app, arguments)
     assert isinstance(end.exception, ConfigError)
     assert "this needs a person at a terminal: Put the load cell" in str(end.exception)
