@@ -519,7 +519,7 @@ def test_a_truncated_log_is_refused_and_recovered_on_request(
     path.write_bytes(fused_log.read_bytes()[:-1000])
     done = run("replay", path)
     assert done.code == 2
-    assert "can be recovered; read what is whole with `gripper-force replay LOG --recover`" in done.err
+    assert "are left; read the rest with `gripper-force replay LOG --recover`" in done.err
     assert "leave this log out elsewhere" in run("evaluate", path, "--checkpoint", "small").err
     recovered = run("replay", path, "--recover", "--json")
     assert recovered.json()["frames"] > 100

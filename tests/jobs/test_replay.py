@@ -170,7 +170,7 @@ def test_a_truncated_log_is_read_only_where_that_is_asked_for(fused_log: Path, t
     data = fused_log.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
     with pytest.raises(
-        LogError, match=r"is cut short, damaged or not finished yet: .* can be recovered; .* --recover"
+        LogError, match=r"is cut short, damaged or not finished yet: .* are left; .* --recover"
     ):
         replay(path)
     result = replay(path, recover=True)
