@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -142,6 +142,26 @@ class ServoFit:
     travelled: Floats
 
 
+class _Statics(NamedTuple):
+    """Fit of the presses.
+
+    Attributes:
+        values: Force per ampere, friction at the mean force, its growth, current offset, and lag, (5,).
+        half: Half of their confidence intervals, (5,).
+        used: The samples without outliers, N of them.
+        force_n: Their forces, (N,).
+        residual_n: Their residuals, (N,).
+        rms_n: Root mean square of these.
+    """
+
+    values: Floats
+    half: Floats
+    used: Regression
+    force_n: Floats
+    residual_n: Floats
+    rms_n: float
+
+
 def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal: Nominal) -> ServoFit:
     """Fits statics to presses, friction in free travel to passes, and geometry to the angles of presses.
 
@@ -166,35 +186,9 @@ def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal
             f"only {len(presses)} presses slid in both directions, and {MIN_PRESSES} are needed; press more often"
         )
     rows = _sliding_rows(presses)
-    force, current, _, side, rate, _, number = rows.T
-    columns = np.column_stack([np.ones(len(rows)), force, side, side * force, rate])
-    beta, used, kept = _robust_fit(Regression(columns, current, number), "presses")
-    force_n = force[kept]
-    mean_n = float(force_n.mean())
-    _require(
-        beta[1] > 0, "the force does not grow with the current; check gripper.closing_sign and the load cell"
-    )
-
-    def statics(b: Floats) -> Floats:
-        n_per_a = 1 / b[1]
-        return np.array([n_per_a, (b[2] + b[3] * mean_n) * n_per_a, b[3] * n_per_a, b[0], b[4] * n_per_a])
-
-    values, half = _jackknife(used, statics, between=2)
-    half[:2] = np.hypot(half[:2], nominal.scale_share * values[:2])
-    n_per_a, friction_n, share, offset_a, lag_s = values
-    residual_n = (used.target - used.columns @ beta) * n_per_a
-    rms_n = float(np.sqrt(np.mean(residual_n**2)))
-    span_n = float(np.ptp(force_n))
-    _require(
-        half[0] < _MAX_HALF_WIDTH * n_per_a,
-        f"the torque constant is only known to within {100 * half[0] / abs(n_per_a):.0f} %; press harder and "
-        "more often, and check that the load cell is straight between the jaws",
-    )
-    _require(
-        rms_n < _MAX_RESIDUAL * span_n and friction_n + half[1] > 0,
-        f"the presses contradict each other: the fit has a residual of {rms_n:.2f} N and a friction of "
-        f"{friction_n:.2f} N; check that the load cell is firm between the jaws and touches nothing else",
-    )
+    statics = _fit_statics(rows, nominal)
+    n_per_a, friction_n, share, offset_a, lag_s = statics.values
+    half, used, force_n = statics.half, statics.used, statics.force_n
     free, free_half, travelled = _fit_travel(passes, n_per_a, half[0], nominal.pinion_radius_m)
     radius, opening, given = _fit_geometry(rows, nominal)
     nm = n_per_a * 2 * radius[0]
@@ -220,11 +214,45 @@ def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal
             float(np.abs(travelled[:, 0]).min()),
             float(np.abs(travelled[:, 0]).max()),
         ),
-        residual_n=rms_n,
+        residual_n=statics.rms_n,
         outliers=len(rows) - len(force_n),
-        pressed=np.column_stack([force_n, used.target, residual_n, sides]),
+        pressed=np.column_stack([force_n, used.target, statics.residual_n, sides]),
         travelled=travelled,
     )
+
+
+def _fit_statics(rows: Floats, nominal: Nominal) -> _Statics:
+    """Fits force and friction under load to the samples of `_sliding_rows`."""
+    force, current, _, side, rate, _, number = rows.T
+    columns = np.column_stack([np.ones(len(rows)), force, side, side * force, rate])
+    beta, used, kept = _robust_fit(Regression(columns, current, number), "presses")
+    force_n = force[kept]
+    mean_n = float(force_n.mean())
+    _require(
+        beta[1] > 0, "the force does not grow with the current; check gripper.closing_sign and the load cell"
+    )
+
+    def values_of(b: Floats) -> Floats:
+        n_per_a = 1 / b[1]
+        return np.array([n_per_a, (b[2] + b[3] * mean_n) * n_per_a, b[3] * n_per_a, b[0], b[4] * n_per_a])
+
+    values, half = _jackknife(used, values_of, between=2)
+    half[:2] = np.hypot(half[:2], nominal.scale_share * values[:2])
+    n_per_a, friction_n = values[:2]
+    residual_n = (used.target - used.columns @ beta) * n_per_a
+    rms_n = float(np.sqrt(np.mean(residual_n**2)))
+    span_n = float(np.ptp(force_n))
+    _require(
+        half[0] < _MAX_HALF_WIDTH * n_per_a,
+        f"the torque constant is only known to within {100 * half[0] / abs(n_per_a):.0f} %; press harder and "
+        "more often, and check that the load cell is straight between the jaws",
+    )
+    _require(
+        rms_n < _MAX_RESIDUAL * span_n and friction_n + half[1] > 0,
+        f"the presses contradict each other: the fit has a residual of {rms_n:.2f} N and a friction of "
+        f"{friction_n:.2f} N; check that the load cell is firm between the jaws and touches nothing else",
+    )
+    return _Statics(values, half, used, force_n, residual_n, rms_n)
 
 
 def _sliding_rows(presses: Sequence[ServoPress]) -> Floats:
