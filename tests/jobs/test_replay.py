@@ -484,3 +484,8 @@ def test_memory_does_not_grow_with_the_records_of_a_log(
         tracemalloc.stop()
     longer_s = 2 * LogReader(fused_log).duration_ns / NS_PER_S
     assert (peaks[1] - peaks[0]) / longer_s < 50_000, "bytes for each second of log"
+
+
+def test_another_engine_is_the_reason_for_other_digits(fused_log: Path) -> None:
+    result = replay(fused_log, overrides=["vision.engine=torch"])
+    assert result.note == "the run's engine was onnxruntime, this one is torch: last digits differ"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gripper_force import __version__
-from gripper_force.config import Overrides
+from gripper_force.config import Overrides, config_from_text
 from gripper_force.errors import DataError, GripperError
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.replay.comparison import (
@@ -174,4 +174,9 @@ def _note(reader: LogReader, resolved: ResolvedConfig) -> str:
     if used != profile:
         names = [text[:12] or "none" for text in (used, profile)]
         return f"the run's object profile was {names[0]}, this one is {names[1]}: estimates differ"
+    engine = config_from_text(reader.config, str(reader.path)).vision.engine
+    if engine != resolved.config.vision.engine:
+        return (
+            f"the run's engine was {engine}, this one is {resolved.config.vision.engine}: last digits differ"
+        )
     return ""
