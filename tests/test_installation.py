@@ -208,7 +208,7 @@ MISSING: list[tuple[list[str], str, str]] = [
     (["train", "data"], "train needs torch", "train"),
     (["evaluate", "data"], "evaluate needs torch", "train"),
     (["teach", "mug"], "teach needs torch", "train"),
-    (["calibrate", "object", "mug"], "calibrate object needs torch", "train"),
+    (["calibrate", "object", "mug"], "calibrate object needs scipy", "calibrate"),
     (["calibrate", "load-cell", "--mass-kg=1", "--yes"], "this command needs scipy", "calibrate"),
     (["export", "small", "--out=small.onnx"], "this command needs torch", "train"),
     (
