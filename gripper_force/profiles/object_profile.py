@@ -4,7 +4,6 @@ A profile is a YAML file, with a safetensors file of the same name beside it for
 `gripper_force.profiles.correction` applies it to the network's estimates.
 """
 
-import os
 from datetime import date
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
+from gripper_force.folders import own_folder
 from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, differences, read_section
 
 FORMAT: Final = "gripper-force-object/1"
@@ -194,9 +194,8 @@ def read_object(path: Path) -> ObjectProfile:
 
 
 def user_folder() -> Path:
-    """Returns the folder of the user's profiles (https://specifications.freedesktop.org/basedir-spec/latest/)."""
-    base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
-    return Path(base) / "gripper-force" / "objects"
+    """Returns the folder of the user's profiles. Raises `ConfigError` if there is none."""
+    return own_folder("XDG_DATA_HOME", ".local/share") / "objects"
 
 
 def find_object(name: str) -> Path:

@@ -4,14 +4,13 @@ An ONNX file holds the header in its metadata, an OpenVINO file in its ``rt_info
 """
 
 import hashlib
-import os
 import xml.etree.ElementTree as ET
 from importlib import import_module
 from pathlib import Path
 from typing import Final
 
 from gripper_force.errors import CheckpointError
-from gripper_force.plugins import importing
+from gripper_force.folders import own_folder
 from gripper_force.vision.header import (
     EXPORTED,
     KEY,
@@ -65,6 +64,7 @@ def exported_file(model: Model, suffix: str) -> Path:
 
     Raises:
         ConfigError: The file was exported for another engine, or a package for the export is not installed.
+        CheckpointError: The checkpoint can't be exported.
     """
     if model.path.suffix == suffix:
         return model.path
@@ -74,12 +74,8 @@ def exported_file(model: Model, suffix: str) -> Path:
         return shipped
     path = cache_folder() / name
     if not path.exists():
-        with importing(
-            f"exporting {model.path.name} for {EXPORTED[suffix]}",
-            ", or run `gripper-force export network` on another machine and set vision.checkpoint to its file",
-        ):
-            exporter = import_module("gripper_force.vision.export")  # no part of a robot's installation
-        exporter.export(model, path)
+        # No part of what a robot runs.
+        import_module("gripper_force.vision.export_process").export_apart(model, path)
     return path
 
 
@@ -108,9 +104,8 @@ def exported_name(model: Model, suffix: str) -> str:
 
 
 def cache_folder() -> Path:
-    """Returns the folder of cached files (https://specifications.freedesktop.org/basedir-spec/latest/)."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "gripper-force"
+    """Returns the folder of cached files. Raises `ConfigError` if there is none."""
+    return own_folder("XDG_CACHE_HOME", ".cache")
 
 
 def _openvino_metadata(path: Path) -> dict[str, str]:
