@@ -5,8 +5,12 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 from gripper_force.errors import DataError
+
+_TRIES: Final = 10
+"""A writer that ends removes the lock file. Another one that has opened it just before opens a new one."""
 
 
 @contextmanager
@@ -16,7 +20,7 @@ def unfinished(path: Path) -> Iterator[Path]:
     One that an interrupted run left is removed first.
 
     Raises:
-        DataError: Another process writes the file.
+        DataError: Another process or thread writes the file.
     """
     part = path.with_name(f".{path.name}.part")
     with _only_writer(path):
@@ -27,33 +31,40 @@ def unfinished(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _only_writer(path: Path) -> Iterator[None]:
-    """Locks a file for this process; without it, two would write and rename the same unfinished file."""
+    """Locks a file for this writer; without it, two would write and rename the same unfinished file."""
     lock = path.with_name(f".{path.name}.lock")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        file = _locked(lock)
     except OSError:  # the writer meets it too, and says what it could not write
         yield
         return
+    if file is None:
+        raise DataError(
+            f"another process or thread is writing {path}; wait until it has ended, or use another folder"
+        )
     try:
-        if not _locked(file):
-            raise DataError(
-                f"another process is writing {path}; wait until it has ended, or use another folder"
-            )
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
+        yield
     finally:
+        lock.unlink(missing_ok=True)
         os.close(file)
 
 
-def _locked(file: int) -> bool:
-    """Locks an open file. Returns False if another process holds the lock, or has just removed the file."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # not every file system has locks
-        return True
-    return os.fstat(file).st_nlink > 0
+def _locked(lock: Path) -> int | None:
+    """Makes, opens and locks a file. Returns its descriptor; None if another writer holds the lock."""
+    for _ in range(_TRIES):
+        file = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        is_free = True
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            is_free = False
+        except OSError:  # not every file system has locks
+            return file
+        is_there = os.fstat(file).st_nlink > 0
+        if is_free and is_there:
+            return file
+        os.close(file)
+        if is_there:
+            break
+    return None

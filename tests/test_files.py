@@ -1,5 +1,6 @@
 """Files that appear once they are complete: what an interruption and a second process leave."""
 
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -44,7 +45,10 @@ def test_a_second_writer_is_refused_and_harms_nothing(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with unfinished(path) as part:
         part.write_text("first")
-        with pytest.raises(DataError, match=r"another process is writing .*a\.mcap; wait"), unfinished(path):
+        with (
+            pytest.raises(DataError, match=r"another process or thread is writing .*a\.mcap; wait"),
+            unfinished(path),
+        ):
             pass
         with unfinished(tmp_path / "b.mcap") as other:  # another file of the folder is free
             other.write_text("other")
@@ -58,4 +62,26 @@ def test_a_killed_writer_locks_nothing(tmp_path: Path) -> None:
     with unfinished(path) as part:
         assert not part.exists()
         part.write_text("whole")
+    assert names(tmp_path) == ["a.mcap"]
+
+
+@pytest.mark.parametrize("error", [None, BlockingIOError])
+def test_a_writer_that_starts_as_another_ends_is_not_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception] | None
+) -> None:
+    """The other one has removed the lock file, and may still hold the lock, when this one locks what it opened."""
+    lock, flock = tmp_path / ".a.mcap.lock", fcntl.flock
+
+    def late(file: int, operation: int) -> None:
+        monkeypatch.setattr(fcntl, "flock", flock)
+        lock.unlink()
+        if error is not None:
+            raise error
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with unfinished(tmp_path / "a.mcap") as part:
+        part.write_text("whole")
+        assert lock.exists()
+        with pytest.raises(DataError), unfinished(tmp_path / "a.mcap"):
+            pass
     assert names(tmp_path) == ["a.mcap"]

@@ -20,7 +20,7 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.processes import process_pool
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.schema import Tree
+from gripper_force.schema import Tree, as_path
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record, ServoState
 
 if TYPE_CHECKING:  # labels need no OpenCV
@@ -100,10 +100,11 @@ def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
 
     Raises:
         DataError: There are no logs, or none in a folder.
+        ConfigError: One is no path.
     """
-    given = [source] if isinstance(source, str | Path) else source
+    given = source if isinstance(source, Iterable) and not isinstance(source, str) else [source]
     found: dict[Path, Path] = {}
-    for path in map(Path, given):
+    for path in (as_path(one, "a log", "name a file or a folder") for one in given):
         logs = sorted(p for p in path.rglob("*.mcap") if not p.is_dir()) if path.is_dir() else [path]
         if not logs:
             raise DataError(f"no logs (*.mcap) in {path}; record, simulate or import some")

@@ -18,7 +18,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
-from gripper_force.errors import DataError, GripperError
+from gripper_force.errors import ConfigError, DataError, GripperError
 from gripper_force.progress import Progress
 from gripper_force.runtime.process import ProcessOptions, allowed_options, own_process
 
@@ -41,10 +41,17 @@ class Workers:
     Attributes:
         count: Processes of this machine; 1: this process.
         ray: Address of a Ray cluster, whose processes are used instead; None for none.
+
+    Raises:
+        ConfigError: The number is none of processes.
     """
 
     count: int = 1
     ray: str | None = None
+
+    def __post_init__(self) -> None:
+        if type(self.count) is not int or self.count < 1:
+            raise ConfigError(f"workers of {self.count!r} is not a whole number from 1 on; pass an int")
 
     @contextmanager
     def pool(self) -> Iterator[Executor]:

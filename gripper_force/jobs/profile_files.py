@@ -83,6 +83,7 @@ def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | Cam
 
     Raises:
         ConfigError: The file exists and is not a rig profile, or it can't be written.
+        DataError: Another process or thread writes it.
     """
     profile = rig_to_update(path)
     names = {LoadCellCalibration: "load_cell", ServoCalibration: "servo", CameraCalibration: "camera"}
@@ -96,6 +97,7 @@ def write_all(files: dict[Path, bytes]) -> None:
 
     Raises:
         ConfigError: One can't be written.
+        DataError: Another process or thread writes one of them.
     """
     try:
         with ExitStack() as stack:

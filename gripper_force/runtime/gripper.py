@@ -139,7 +139,9 @@ class Gripper:
                 ``new_object`` is True while an object is held.
             DeviceError: A device failed.
         """
-        return self._grip(force_n, wait=wait, new_object=new_object)
+        self._resolved.check_target(force_n)
+        request = PendingRequest(RequestKind.GRASP, float(force_n), new_object=new_object, is_awaited=wait)
+        return self._loop.request(request)
 
     @overload
     def set_force(self, force_n: float, *, wait: Literal[True] = True) -> GraspResult: ...
@@ -163,7 +165,9 @@ class Gripper:
             RequestError: No object is gripped, or the force is out of range.
             DeviceError: A device failed.
         """
-        return self._grip(force_n, wait=wait, needs_object=True)
+        self._resolved.check_target(force_n)
+        request = PendingRequest(RequestKind.GRASP, float(force_n), needs_object=True, is_awaited=wait)
+        return self._loop.request(request)
 
     def move(self, width_m: float, *, wait: bool = True) -> float:
         """Moves the jaws to a width, and lets go of an object if one is gripped.
@@ -300,17 +304,3 @@ class Gripper:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._loop.close(error)
-
-    def _grip(
-        self, force_n: float, *, wait: bool, new_object: bool = False, needs_object: bool = False
-    ) -> GraspResult | None:
-        self._resolved.check_target(force_n)
-        return self._loop.request(
-            PendingRequest(
-                RequestKind.GRASP,
-                target_n=float(force_n),
-                new_object=new_object,
-                needs_object=needs_object,
-                is_awaited=wait,
-            )
-        )

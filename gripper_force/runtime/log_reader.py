@@ -29,6 +29,7 @@ from gripper_force.runtime.log_codecs import (
     Codec,
     own_fields,
 )
+from gripper_force.schema import as_path
 from gripper_force.types import NS_PER_S, Record
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
@@ -71,11 +72,12 @@ class LogReader:
         utc_offset_ns: UTC less the clock of the records, in nanoseconds; 0 if that clock is simulated.
 
     Raises:
+        ConfigError: ``path`` is no path.
         LogError: The file is missing, no MCAP, not of this project, or (without ``recover``) cut short.
     """
 
     def __init__(self, path: str | Path, *, recover: bool = False) -> None:
-        self.path = path = Path(path)
+        self.path = path = as_path(path, "the log")
         self.complete = False
         self.utc_offset_ns = 0
         self.metadata: dict[str, str] = {}

@@ -24,7 +24,7 @@ def checked_number(value: Any, name: str) -> float:
     """Returns an argument as a float. Raises `RequestError` if it is no number, or too large to be plausible."""
     found = math.nan
     with suppress(TypeError, ValueError, OverflowError):
-        found = math.nan if isinstance(value, str | bytes | bool | np.bool_) else float(value)
+        found = math.nan if np.asarray(value).dtype.kind in "bSU" else float(value)
     if not abs(found) <= _MAX_MAGNITUDE:
         raise RequestError(f"{name} of {value!r} is not a number of at most {_MAX_MAGNITUDE:g}; pass a float")
     return found

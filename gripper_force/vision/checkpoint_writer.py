@@ -19,6 +19,7 @@ def save_checkpoint(path: Path, networks: Sequence[Member], header: Header) -> N
 
     Raises:
         CheckpointError: The file can't be written.
+        DataError: Another process or thread writes it.
     """
     tensors = {
         f"{i}.{name}": _stored(tensor)
@@ -59,6 +60,7 @@ def replace_header(source: str | Path, header: Header, out: Path | None = None) 
 
     Raises:
         CheckpointError: A file can't be read or written.
+        DataError: Another process or thread writes the checkpoint.
     """
     path, data, before = read_checkpoint(source)
     identity = digest_of(data, before)

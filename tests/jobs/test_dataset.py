@@ -1,5 +1,6 @@
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from gripper_force.jobs.dataset import (
     NEAR_NS,
     Clip,
     digest,
+    find_logs,
     indentations,
     label_frames,
     load_clip,
@@ -106,6 +108,12 @@ def test_logs_become_clips(tmp_path: Path) -> None:
     np.testing.assert_allclose(b.forces_n[:3], [0.25, 2.0, 4.0], rtol=1e-6)
     (again,) = load_clips([tmp_path / "deep" / "b.mcap"], SMALL, region=(0, 0, 30, 30))
     np.testing.assert_array_equal(again.frames[0], downscale(frames[0].gray, (0, 0, 30, 30), 16))
+
+
+@pytest.mark.parametrize("logs", [3, [3], None])
+def test_logs_that_are_no_paths_are_refused(logs: Any) -> None:
+    with pytest.raises(ConfigError, match=r"a log must be a path, not .*; name a file or a folder"):
+        find_logs(logs)
 
 
 def test_missing_logs_frames_or_labels_raise(tmp_path: Path) -> None:

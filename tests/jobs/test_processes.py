@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gripper_force.errors import DataError, GripperError, UnfamiliarFrameError
+from gripper_force.errors import ConfigError, DataError, GripperError, UnfamiliarFrameError
 from gripper_force.jobs.processes import Workers, process_pool
 from gripper_force.progress import no_progress
 
@@ -163,6 +163,12 @@ def read_or_fail(log: Path) -> str:
         case "unsendable":
             raise UnsendableError(1, 2)
     return log.stem
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.0, True, "2"])
+def test_a_number_that_is_none_of_processes_is_refused(count: int) -> None:
+    with pytest.raises(ConfigError, match=r"workers of .* is not a whole number from 1 on; pass an int"):
+        Workers(count)
 
 
 @pytest.mark.parametrize("count", [1, 2])

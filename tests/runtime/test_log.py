@@ -17,7 +17,7 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from gripper_force.errors import LogError
+from gripper_force.errors import ConfigError, LogError
 from gripper_force.runtime.log_codecs import CODECS, INTERVAL_STD, UTC_NAME
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import CHUNK_NS, LogWriter
@@ -203,6 +203,11 @@ def test_an_offset_that_is_no_number_is_refused(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(LogError, match="is empty, or damaged at its start"):
         LogReader(path)
+
+
+def test_what_is_no_path_is_refused() -> None:
+    with pytest.raises(ConfigError, match="the log must be a path, not 3"):
+        LogReader(3)  # type: ignore[arg-type]
 
 
 def test_another_program_decodes_every_topic_from_the_log_alone(tmp_path: Path) -> None:

@@ -1,12 +1,16 @@
 from collections.abc import Callable
 from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.errors import RequestError
-from gripper_force.runtime.requests import PendingRequest, RequestQueue
+from gripper_force.runtime.requests import PendingRequest, RequestQueue, checked_number
 from gripper_force.runtime.state import GraspResult, GripperState
 from gripper_force.types import EstimateSource, Outcome, Phase, RequestKind
 
@@ -266,3 +270,16 @@ def test_other_requests_are_all_handled(
     second = cycle.submit(kind, needs_object=needs_object, wait=wait)
     third = cycle.submit(RequestKind.GRASP, wait=False)
     assert [cycle.run(Phase.HOLD) for _ in range(4)] == [first, second, third, None]
+
+
+@pytest.mark.parametrize(
+    "value", [True, np.True_, np.array(True), "3", b"3", np.array("3"), None, [1, [2]], 1e10, np.nan]
+)
+def test_what_is_no_number_is_refused(value: Any) -> None:
+    with pytest.raises(RequestError, match=r"a force of .* is not a number of at most 1e"):
+        checked_number(value, "a force")
+
+
+@pytest.mark.parametrize("value", [3, 3.0, np.float32(3), np.int8(3), np.array(3), Fraction(3), Decimal(3)])
+def test_numbers_of_any_kind_are_accepted(value: Any) -> None:
+    assert checked_number(value, "a force") == 3.0
