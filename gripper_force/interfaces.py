@@ -102,7 +102,7 @@ class Servo(Protocol):
         ...
 
     def read(self) -> ServoState:
-        """Reads a `ServoState` in one bus transaction."""
+        """Reads a `ServoState`, in one bus transaction if all of it fits."""
         ...
 
     def write(self, command: ServoCommand) -> None:

@@ -50,7 +50,7 @@ _WRITE_BLOCK: Final = struct.Struct("<hi")
 CYCLE_BYTES: Final = _READ_BLOCK.size + _VOLTAGE.size
 """Bytes that a cycle reads from each servo. Where they do not fit, the voltage has a transaction of its own."""
 
-_VOLTAGE_CYCLES: Final = 20
+VOLTAGE_CYCLES: Final = 20
 """Cycles between two readings of the voltage on its own."""
 
 _INDIRECT_ADDRESSES: Final = tuple(
@@ -64,6 +64,11 @@ MIN_FIRMWARE: Final = 38
 """The first firmware with Drive Mode and Bus Watchdog."""
 # Names of the bits of Hardware Error Status.
 _ERRORS: Final = ("input voltage", "", "overheating", "motor encoder", "electrical shock", "overload")
+
+
+def read_size(window: IndirectWindow) -> int:
+    """Returns how many of `CYCLE_BYTES` fit into the window, with the write block of 6 bytes and up to 7 of padding."""
+    return CYCLE_BYTES if window.length > CYCLE_BYTES + _WRITE_BLOCK.size else _READ_BLOCK.size
 
 
 class DynamixelBus:
@@ -156,9 +161,7 @@ class DynamixelBus:
                 firmware.append(self._read_firmware(id_))
             self.firmware = tuple(firmware)
             window = self._common_window()
-            # The window holds the read block with up to 7 bytes of padding, and the write block of 6 bytes.
-            fits = window.length > CYCLE_BYTES + _WRITE_BLOCK.size
-            self._read_size = CYCLE_BYTES if fits else _READ_BLOCK.size
+            self._read_size = read_size(window)
             for id_ in self.ids:
                 self._configure(id_, window)
             self._data_address = window.data
@@ -174,7 +177,7 @@ class DynamixelBus:
         return states
 
     def read(self) -> tuple[ServoState, ...]:
-        """Reads every servo in one transaction.
+        """Reads every servo in one transaction, and every 20th time in another one a voltage that does not fit.
 
         Raises:
             HardwareFaultError: A servo's watchdog tripped, or it restarted and lost its settings. A hardware
@@ -185,7 +188,7 @@ class DynamixelBus:
         fast = min(self.firmware, default=0) >= self.model.fast_sync_read_firmware
         read = partial(self._transport.sync_read, self.ids, fast=fast)
         apart = self._read_size < CYCLE_BYTES
-        if apart and (not self._voltages or self.stats.cycles % _VOLTAGE_CYCLES == 0):
+        if apart and (not self._voltages or self.stats.cycles % VOLTAGE_CYCLES == 0):
             self._voltages = read(_INDIRECT_ADDRESSES[_READ_BLOCK.size], _VOLTAGE.size)[1]
         t_ns, blocks = read(self._data_address, self._read_size)
         self.stats.cycles += 1
@@ -419,7 +422,7 @@ class DynamixelServo:
         return self._pair.combine(self._bus.start(self._pair.start))
 
     def read(self) -> ServoState:
-        """Reads the state in one transaction; raises those of `DynamixelBus.read` and `FingerPair.combine`."""
+        """Reads the state; see `DynamixelBus.read`, whose errors it raises, and those of `FingerPair.combine`."""
         states = self._bus.read()
         return states[0] if self._pair is None else self._pair.combine(states)
 

@@ -12,15 +12,13 @@ from gripper_force.interfaces import Camera, Clock, LoadCell
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample
 from gripper_hw.fault_injection import Faults
 from gripper_hw.load_cells.screening import SampleValidator
+from gripper_hw.sim.simulated_rig import GAMMA
 
 # The values of the fault kinds of `FAULTS`, in the order of its units: camera, load cell, clock.
 _SLOW_FRAME_PERIOD_NS = NS_PER_S // 5
 _FRAME_DELAY_NS = 300 * NS_PER_MS
 _LOST_FRAMES_SHARE = 0.8
 _LIGHT_FACTOR = 6.0
-_GAMMA = 2.2
-"""Encoding of the simulated camera."""
-
 _SLOW_SAMPLE_PERIOD_NS = NS_PER_S // 2
 _SAMPLE_DELAY_NS = 500 * NS_PER_MS
 _GAP_NS = 300 * NS_PER_MS
@@ -60,7 +58,7 @@ class FaultyCamera:
                 noise = self._rng.integers(0, 256, frame.gray.shape, np.uint8)
                 return replace(frame, gray=noise)
             case "wrong":
-                bright = 255 * np.minimum(_LIGHT_FACTOR * (frame.gray / 255) ** _GAMMA, 1) ** (1 / _GAMMA)
+                bright = 255 * np.minimum(_LIGHT_FACTOR * (frame.gray / 255) ** GAMMA, 1) ** (1 / GAMMA)
                 return replace(frame, gray=bright.astype(np.uint8))
             case "slow":
                 if now_ns < self._next_ns:

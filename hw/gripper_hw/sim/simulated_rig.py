@@ -41,7 +41,9 @@ _WHITE_LUX = 470.0
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in gray (ITU-R BT.601)."""
 
-_GAMMA = 2.2
+GAMMA = 2.2
+"""Encoding of the simulated camera."""
+
 _READ_NOISE = 0.002
 """Standard deviation of the read noise, as a share of full scale."""
 
@@ -418,11 +420,11 @@ def expose(
     gray = pixels @ _LUMA / 255.0  # (H, W)
     y, x = np.ogrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width * width / 4)
-    linear = gray**_GAMMA
+    linear = gray**GAMMA
     if blur_px:
         linear = cv2.GaussianBlur(linear, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
     linear = linear * np.float32(lux / _WHITE_LUX) * (1 - _VIGNETTE * radius2).astype(np.float32)
     spread = np.sqrt(shot_noise**2 * linear + _READ_NOISE**2)
     linear += rng.standard_normal(gray.shape, dtype=np.float32) * spread
-    encoded: Gray = (255 * np.clip(linear, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
+    encoded: Gray = (255 * np.clip(linear, 0, 1) ** (1 / GAMMA)).astype(np.uint8)
     return encoded

@@ -1,6 +1,7 @@
 import os
 import termios
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -123,6 +124,15 @@ def test_replies_too_late_for_a_run_are_still_measured(endpoint):
     endpoint.bus.tamper = late
     cycle = rows(endpoint, reply_margin_ms=1.0)["servo 1", "bus cycle"]
     assert cycle.found.endswith(" of 200 reads")
+
+
+@pytest.mark.parametrize(("name", "apart"), [("XM430-W350", 0), ("XL330-M288", 10)])
+def test_the_time_of_a_cycle_is_that_of_all_its_reads(make_endpoint, name, apart):
+    """An XL330's voltage does not fit: every 20th cycle reads its 2 bytes on their own, with up to 7 of padding."""
+    endpoint = make_endpoint(VirtualServo(1, load_model(name)))
+    assert "of 200 reads" in rows(endpoint, model=name)["servo 1", "bus cycle"].found
+    reads = [packet for packet in endpoint.packets() if packet.instruction == Instruction.FAST_SYNC_READ]
+    assert Counter(packet.params[2] > 9 for packet in reads) == Counter({True: 200, False: apart})
 
 
 def test_other_servos_are_listed(make_endpoint):

@@ -56,6 +56,21 @@ def test_ratios_become_samples_and_out_of_range_is_saturation(
     cell.close()
 
 
+def test_an_error_and_the_ratio_that_follows_it_are_one_reading(phidget_library: SimpleNamespace) -> None:
+    cell = make_cell()
+    cell.start()
+    (channel,) = phidget_library.VoltageRatioInput.made
+    saturated = []
+    for ratio in (None, 1 / 128, 1 / 128, None, 1 / 128, None, None, 0.0, 1 / 128):  # None: an error
+        if ratio is None:
+            channel.told["OnErrorHandler"](channel, 4103, "Overrange")
+        else:
+            channel.told["OnVoltageRatioChangeHandler"](channel, ratio)
+        saturated.append(cell.stats.saturated)
+    assert saturated == [1, 1, 2, 3, 3, 4, 5, 5, 6]
+    cell.close()
+
+
 @pytest.mark.parametrize("code", [4103, 4105, 4114, 4115])
 def test_each_error_for_a_reading_out_of_range_is_saturation(
     phidget_library: SimpleNamespace, code: int
