@@ -49,8 +49,8 @@ _GAIN_BOUND: Final = 1.1
 TOLERANCE: Final = 0.05
 """Share by which a peak may exceed the force limit."""
 
-_AFTER_NS: Final = 300 * NS_PER_MS
-"""Time after the run in which the peak force is still observed."""
+AFTER_NS: Final = 300 * NS_PER_MS
+"""Time after the run in which force and speed are still observed."""
 
 _MAX_LOST_MS: Final = 100 + 5
 """Longest allowed gap at the end of a log: one chunk and one control cycle."""
@@ -283,8 +283,8 @@ def _grasp(config: Config, folder: Path) -> Grasp:
 
 
 def _peak_after(devices: Devices) -> float:
-    """Highest force in N within `_AFTER_NS` after the end of the run."""
-    devices.clock.sleep_until_ns(devices.clock.now_ns() + _AFTER_NS)
+    """Highest force in N within `AFTER_NS` after the end of the run."""
+    devices.clock.sleep_until_ns(devices.clock.now_ns() + AFTER_NS)
     samples = devices.load_cell.drain() if devices.load_cell is not None else []
     return max((sample.force_n for sample in samples if sample.valid), default=0.0)
 

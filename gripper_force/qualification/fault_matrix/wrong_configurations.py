@@ -22,13 +22,14 @@ from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.trials import TRIAL_TARGETS_N
 from gripper_force.progress import Progress, no_progress
+from gripper_force.qualification.fault_matrix.matrix import AFTER_NS
 from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile, collect
 from gripper_force.qualification.safety_statements import FORCE_SHARE, SPEED_SHARE, SafetyStatements
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_session
 from gripper_force.schema import Tree, assign_value
-from gripper_force.types import NS_PER_MS, NS_PER_S, GraspStatus, Outcome, Phase, RequestKind
+from gripper_force.types import NS_PER_S, GraspStatus, Outcome, Phase, RequestKind
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,9 +42,6 @@ _LIMIT_SPARE: Final = 1.001
 
 _AFTER_OUTCOME_NS: Final = NS_PER_S
 """Time for which a grasp goes on after its outcome has last changed."""
-
-_AFTER_NS: Final = 300 * NS_PER_MS
-"""Time after the run in which force and speed are still observed."""
 
 _REALTIME_TRIES: Final = 3
 _START_M: Final = 0.016
@@ -320,7 +318,7 @@ def _run_once(config: Config, keys: dict[str, Any], expected: Sequence[str]) -> 
             devices.observe_world(world.append)
             with open_session(resolved, devices, None) as session:
                 result = _grasp_and_release(session, config.target_n, statuses, world)
-            devices.clock.sleep_until_ns(devices.clock.now_ns() + _AFTER_NS)
+            devices.clock.sleep_until_ns(devices.clock.now_ns() + AFTER_NS)
     except GripperError as error:
         # A device that is lost, times out or fails has a subclass of DeviceError.
         refused = not statuses and type(error) in (ConfigError, DeviceError)
