@@ -679,7 +679,7 @@ class Config(Section):
         return self.camera.backend != "none" and self.vision.checkpoint != "none"
 
     def with_values(self, **values: Any) -> Self:
-        """Returns a copy with other values, which are not validated. A dict changes only the keys of that section."""
+        """Returns a copy with other values, not yet validated. A dict changes only the keys of that section."""
         parts = {k: getattr(self, k).model_copy(update=v) for k, v in values.items() if isinstance(v, dict)}
         return self.model_copy(update=values | parts)
 

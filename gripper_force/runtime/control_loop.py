@@ -6,13 +6,14 @@ import atexit
 import contextlib
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from gripper_force.config import Config
 from gripper_force.control.state_machine import Decision
-from gripper_force.errors import DeviceTimeoutError, RequestError
+from gripper_force.errors import DeviceTimeoutError, GripperError, RequestError
 from gripper_force.interfaces import SharedPort
 from gripper_force.runtime.process import deferred_signals
 from gripper_force.runtime.requests import CLOSED, PendingRequest, RequestQueue, checked_number
@@ -35,6 +36,7 @@ class ControlLoop:
     Attributes:
         session: The session.
         state: State after the newest control cycle.
+        owner: Returns the program's object, None if the program has lost it. The thread then ends the run.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class ControlLoop:
         self._requests, self._tracker = RequestQueue(), StateTracker()
         self._resources = contextlib.ExitStack()  # of the caller's thread
         self._thread: threading.Thread | None = None
+        self.owner: Callable[[], object] = lambda: True
         self._cycle_lock = threading.RLock()  # of the thread that runs the cycle with background=False
         # Written by the thread that runs the control cycle; the first two exist once the loop is open:
         self.session: Session
@@ -79,7 +82,12 @@ class ControlLoop:
                 return None
             while not (self._background or request.result.done()):
                 self.step()
-        request.result.exception()  # waits
+        try:
+            request.result.exception()  # waits
+        except BaseException:  # an interrupt: jaws that close must not go on without their program
+            with contextlib.suppress(GripperError):
+                self.stop()
+            raise
         self._raise_error()
         return request.result.result()
 
@@ -212,7 +220,7 @@ class ControlLoop:
             ) as session:
                 try:
                     self._start(session)
-                    while not self._closing.is_set():
+                    while not self._closing.is_set() and self.owner() is not None:
                         self._cycle(session)
                 except BaseException as error:
                     self._error = error  # before the end of the session, which may open the jaws first

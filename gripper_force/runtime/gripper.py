@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, overload
 
-from gripper_force.config import Config, Overrides, load_config
+from gripper_force.config import Config, Overrides, config_from, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Lock, SharedPort
 from gripper_force.runtime.control_loop import ControlLoop
@@ -62,7 +63,7 @@ def open_gripper(
     if isinstance(config, Config):
         if overrides:
             raise ConfigError("overrides change a file or the defaults; pass them to load_config instead")
-        settings = config
+        settings = config_from(config.model_dump(warnings=False), "open_gripper")  # copies are not checked
     else:
         settings = load_config(config, overrides)
     lockstep = settings.clock == "lockstep"
@@ -70,8 +71,7 @@ def open_gripper(
         raise ConfigError(
             "clock=lockstep runs in the caller's thread; leave background out, or set clock=realtime"
         )
-    if background is None:
-        background = not lockstep
+    background = not lockstep if background is None else background
     if (port is None) != (port_lock is None):
         raise ConfigError("a shared port needs port and port_lock; pass both to open_gripper")
     shared = None if port is None or port_lock is None else SharedPort(port, port_lock)
@@ -96,7 +96,8 @@ class Gripper:
     too slow for real time `SimulationError`.
 
     However the gripper is closed, the servo is left as configured: as ``on_exit`` says, or as ``control.on_fault`` says
-    after a fault, a stop or an exception.
+    after a fault, a stop or an exception. A gripper with a background thread is also closed once nothing refers to it.
+    Ctrl-C in a call that waits for a request stops the gripper, or ends the run without a background thread.
 
     Once the run has ended, every method but `close`, and every newest value, raises the error that ended it, or
     `RequestError` after `close`.
@@ -109,7 +110,7 @@ class Gripper:
     """
 
     def __init__(self, loop: ControlLoop, log: Path | None) -> None:
-        self._loop = loop
+        self._loop, loop.owner = loop, weakref.ref(self)
         self._resolved = loop.session.resolved
         self.config, self.log = self._resolved.config, log
 

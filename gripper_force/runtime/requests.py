@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -22,12 +21,10 @@ _MAX_MAGNITUDE: Final = 1e9
 
 def checked_number(value: Any, name: str) -> float:
     """Returns an argument as a float. Raises `RequestError` if it is no number, or too large to be plausible."""
-    found = math.nan
     with suppress(TypeError, ValueError, OverflowError):
-        found = math.nan if np.asarray(value).dtype.kind in "bSU" else float(value)
-    if not abs(found) <= _MAX_MAGNITUDE:
-        raise RequestError(f"{name} of {value!r} is not a number of at most {_MAX_MAGNITUDE:g}; pass a float")
-    return found
+        if np.asarray(value).dtype.kind not in "bSU" and abs(found := float(value)) <= _MAX_MAGNITUDE:
+            return found
+    raise RequestError(f"{name} of {value!r} is not a number of at most {_MAX_MAGNITUDE:g}; pass a float")
 
 
 @dataclass(eq=False, slots=True)
@@ -148,11 +145,8 @@ class RequestQueue:
             self._queued, self._started = [], []
 
     def _will_be_at_fault(self) -> bool:
-        at_fault = self._phase == Phase.FAULT
-        for request in self._queued:
-            if request.kind in (RequestKind.STOP, RequestKind.RELEASE):
-                at_fault = request.kind == RequestKind.STOP
-        return at_fault
+        kinds = [one.kind for one in self._queued if one.kind in (RequestKind.STOP, RequestKind.RELEASE)]
+        return kinds[-1] == RequestKind.STOP if kinds else self._phase == Phase.FAULT
 
     def _start(self, request: PendingRequest, refusal: str) -> None:
         index = self._queued.index(request)

@@ -990,6 +990,58 @@ def test_ctrl_c_during_the_first_frames_ends_the_run(
     assert len(list(LogReader(tmp_path / "run.mcap").records(gf.GraspStatus))) <= 1
 
 
+@pytest.mark.parametrize("permission", ["library_process", "own_process"])
+def test_ctrl_c_in_a_call_that_waits_stops_the_gripper(
+    real_time: Open, request: pytest.FixtureRequest, permission: str
+) -> None:
+    request.getfixturevalue(permission)
+    gripper = real_time("control.timeout_s=60", "control.approach_speed_m_s=0.001")
+
+    def interrupt() -> None:
+        while gripper.state.phase != gf.Phase.APPROACH:
+            time.sleep(0.001)
+        ctrl_c()
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        gripper.grasp(2.0)
+    thread.join()
+    with pytest.raises(gf.RequestError, match=r"stopped or in fault.*call release first"):
+        gripper.grasp(2.0)
+    gripper.release()
+
+
+def test_a_gripper_that_is_lost_is_closed(
+    quick: list[str], server: PtyServer, opening: list[ControlLoop]
+) -> None:
+    sets = [*quick, "clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
+    sets += ["servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=500"]
+    gripper = gf.open_gripper(overrides=sets)
+    assert torque(server) == 1
+    del gripper
+    assert opening[0]._ended.wait(60)
+    assert torque(server) == 0
+    with gf.open_gripper(overrides=sets) as again:  # the port is free
+        assert again.state.phase == gf.Phase.OPEN
+
+
+@pytest.mark.parametrize(
+    ("values", "key"),
+    [
+        ({"control": {"on_fault": "nothing"}}, "control.on_fault"),
+        ({"control": {"force_limit_n": 1e4}}, "control.force_limit_n"),
+        ({"seed": "three"}, "seed"),
+    ],
+)
+def test_a_copy_of_a_configuration_with_wrong_values_is_refused(
+    quick: list[str], values: dict[str, Any], key: str
+) -> None:
+    config = gf.load_config(overrides=quick).with_values(**values)
+    with pytest.raises(gf.ConfigError, match=rf"configuration key '{key}' \(from open_gripper\)"):
+        gf.open_gripper(config)
+
+
 # Nothing of the process is changed without permission.
 
 
