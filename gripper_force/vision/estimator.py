@@ -11,6 +11,7 @@ from gripper_force.config import MAX_COVERED, VisionConfig, config_from
 from gripper_force.errors import ConfigError, DataError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.profiles.correction import Correction, load_correction
 from gripper_force.profiles.object_profile import find_object, read_object
+from gripper_force.schema import as_path
 from gripper_force.types import ForceEstimate, Gray
 from gripper_force.vision.engines import Engine, Floats, Precision, StepOutput, open_engine
 from gripper_force.vision.frame_checks import FrameChecks
@@ -103,11 +104,12 @@ class ForceEstimator:
 
         Raises:
             CheckpointError: The network's file is missing or damaged.
-            ConfigError: The engine is unknown, not installed, or can't run this file or precision; the
-                profile does not exist, is damaged, or belongs to another network; or ``max_covered`` is out of range.
+            ConfigError: ``checkpoint`` is no path; the engine is unknown, not installed, or can't run this file or
+                precision; the profile does not exist, is damaged, or belongs to another network; or ``max_covered`` is
+                out of range.
         """
         vision = config_from({"vision": {"max_covered": max_covered}}, "ForceEstimator.load").vision
-        model = read_model(checkpoint)
+        model = read_model(as_path(checkpoint, "the network", "name a file, default or small"))
         correction = None if profile is None else _profile_correction(model, str(profile))
         return cls(open_engine(model, engine, precision, threads), region, correction, vision.max_covered)
 

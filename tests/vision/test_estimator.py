@@ -281,6 +281,8 @@ def test_load_names_what_is_unknown(tiny_checkpoint: Path) -> None:
         ForceEstimator.load(tiny_checkpoint, profile="no_such_object")
     with pytest.raises(ConfigError, match=r"unknown vision\.engine 'tensorrt'"):
         ForceEstimator.load(tiny_checkpoint, engine="tensorrt")
+    with pytest.raises(ConfigError, match="the network must be a path, not 3; name a file, default or small"):
+        ForceEstimator.load(3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("max_covered", [-0.1, 0.51, float("nan"), "wide"])
