@@ -84,9 +84,10 @@ class ControlLoop:
                 self.step()
         try:
             request.result.exception()  # waits
-        except BaseException:  # an interrupt: jaws that close must not go on without their program
+        except BaseException:  # an interrupt: jaws that close must not go on; an object that they grip stays
             with contextlib.suppress(GripperError):
-                self.stop()
+                if not (request.kind == RequestKind.RELEASE or self.state.phase in GRIPPING):
+                    self.stop()
             raise
         self._raise_error()
         return request.result.result()

@@ -97,7 +97,7 @@ class Gripper:
 
     However the gripper is closed, the servo is left as configured: as ``on_exit`` says, or as ``control.on_fault`` says
     after a fault, a stop or an exception. A gripper with a background thread is also closed once nothing refers to it.
-    Ctrl-C in a call that waits for a request stops the gripper, or ends the run without a background thread.
+    Ctrl-C in a call that waits while the jaws close stops them, or ends the run without a background thread.
 
     Once the run has ended, every method but `close`, and every newest value, raises the error that ended it, or
     `RequestError` after `close`.

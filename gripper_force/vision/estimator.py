@@ -152,10 +152,8 @@ class ForceEstimator:
             raise DataError(f"the frame is {gray.shape}, but the stream began with {self._shape}; {remedy}")
         self._frame_checks.check(small)
         self._shape = gray.shape
-        step = None
-        for frame in self._normaliser.push(small):
-            step = self._engine.step(frame)
-        return None if step is None else self._estimate(step)
+        steps = [self._engine.step(frame) for frame in self._normaliser.push(small)]
+        return self._estimate(steps[-1]) if steps else None
 
     def _estimate(self, step: StepOutput) -> ForceEstimate:
         """Returns the estimate for the networks' output."""

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -990,23 +990,41 @@ def test_ctrl_c_during_the_first_frames_ends_the_run(
     assert len(list(LogReader(tmp_path / "run.mcap").records(gf.GraspStatus))) <= 1
 
 
-@pytest.mark.parametrize("permission", ["library_process", "own_process"])
-def test_ctrl_c_in_a_call_that_waits_stops_the_gripper(
-    real_time: Open, request: pytest.FixtureRequest, permission: str
-) -> None:
-    request.getfixturevalue(permission)
-    gripper = real_time("control.timeout_s=60", "control.approach_speed_m_s=0.001")
+@contextmanager
+def interrupted_in(phase: gf.Phase, gripper: gf.Gripper) -> Iterator[None]:
+    """Presses Ctrl-C once the gripper is in a phase."""
 
     def interrupt() -> None:
-        while gripper.state.phase != gf.Phase.APPROACH:
+        while gripper.state.phase != phase:
             time.sleep(0.001)
         ctrl_c()
 
     thread = threading.Thread(target=interrupt)
     thread.start()
     with pytest.raises(KeyboardInterrupt):
-        gripper.grasp(2.0)
+        yield
     thread.join()
+
+
+def test_ctrl_c_in_a_call_that_waits_leaves_jaws_that_grip(
+    real_time: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_loop, "GRIPPING", (gf.Phase.APPROACH,))  # this rig has no object
+    gripper = real_time("control.timeout_s=60", "control.approach_speed_m_s=0.001")
+    with interrupted_in(gf.Phase.APPROACH, gripper):
+        gripper.grasp(2.0)
+    time.sleep(0.1)
+    assert gripper.state.phase == gf.Phase.APPROACH
+
+
+@pytest.mark.parametrize("permission", ["library_process", "own_process"])
+def test_ctrl_c_in_a_call_that_waits_stops_jaws_that_close(
+    real_time: Open, request: pytest.FixtureRequest, permission: str
+) -> None:
+    request.getfixturevalue(permission)
+    gripper = real_time("control.timeout_s=60", "control.approach_speed_m_s=0.001")
+    with interrupted_in(gf.Phase.APPROACH, gripper):
+        gripper.grasp(2.0)
     with pytest.raises(gf.RequestError, match=r"stopped or in fault.*call release first"):
         gripper.grasp(2.0)
     gripper.release()
