@@ -148,9 +148,8 @@ class _Feed:
         self._had_network = bool(reader.metadata.get("checkpoint"))
         self._newest: VisualForce | None = None
         self._request: Request | None = None
-        self._pending: dict[
-            int, VisualForce | None
-        ] = {}  # by number of the frame, until the log's estimate comes
+        # By number of the frame, until the log's estimate comes.
+        self._pending: dict[int, VisualForce | None] = {}
         # NaN, of a covered view, does not equal itself.
         self._estimates = _RecordMatcher(
             lambda v: (v.seq, None if math.isnan(v.force_n) else v.force_n, v.std_n)
