@@ -9,8 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import numpy as np
-
 from gripper_force.errors import RequestError
 from gripper_force.runtime.state import GraspResult, GripperState
 from gripper_force.types import GRIPPING, Outcome, Phase, RequestKind
@@ -21,8 +19,9 @@ _MAX_MAGNITUDE: Final = 1e9
 
 def checked_number(value: Any, name: str) -> float:
     """Returns an argument as a float. Raises `RequestError` if it is no number, or too large to be plausible."""
-    with suppress(TypeError, ValueError, OverflowError):
-        if np.asarray(value).dtype.kind not in "bSU" and abs(found := float(value)) <= _MAX_MAGNITUDE:
+    with suppress(TypeError, ValueError, OverflowError, RuntimeError):
+        plain = value.item() if hasattr(value, "item") else value  # of NumPy, or a tensor, also on a GPU
+        if not isinstance(plain, str | bytes | bool) and abs(found := float(value)) <= _MAX_MAGNITUDE:
             return found
     raise RequestError(f"{name} of {value!r} is not a number of at most {_MAX_MAGNITUDE:g}; pass a float")
 

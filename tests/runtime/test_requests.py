@@ -280,6 +280,21 @@ def test_what_is_no_number_is_refused(value: Any) -> None:
         checked_number(value, "a force")
 
 
-@pytest.mark.parametrize("value", [3, 3.0, np.float32(3), np.int8(3), np.array(3), Fraction(3), Decimal(3)])
+class OnGpu:
+    """A tensor that NumPy can't read, but Python can."""
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    def item(self) -> float:
+        return 3.0
+
+    def __float__(self) -> float:
+        return 3.0
+
+
+@pytest.mark.parametrize(
+    "value", [3, 3.0, np.float32(3), np.int8(3), np.array(3), Fraction(3), Decimal(3), OnGpu()]
+)
 def test_numbers_of_any_kind_are_accepted(value: Any) -> None:
     assert checked_number(value, "a force") == 3.0
