@@ -101,7 +101,7 @@ def tell_kept(what: str, *, fresh: bool) -> None:
 
 
 def prompt(
-    yes: bool, status: "Status | Bar | None" = None, without: str = "if it is done, pass --yes"
+    yes: bool, status: "Status | Bar | None" = None, without: str = "pass --yes if it is done"
 ) -> "Prompt":
     """Returns a prompt that waits for Enter, or with ``yes`` only prints. Meanwhile ``status`` is hidden.
 
@@ -117,7 +117,7 @@ def prompt(
             return
         if not sys.stdin.isatty():
             raise ConfigError(
-                f"this needs a person at a terminal: {text}; run it in a terminal or, {without}"
+                f"this needs a person at a terminal: {text}; run it in a terminal, or {without}"
             )
         if status is not None:
             status.stop()

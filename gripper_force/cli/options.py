@@ -3,7 +3,7 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -36,6 +36,9 @@ SummaryFolder = Annotated[
     ),
 ]
 Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
+
+_NAMES: Final = {"sim.yaw_deg": "--degrees", "calibration.object": "--profile"}
+"""Options whose names are not the last part of their keys."""
 
 
 def again(config: Path | None, overrides: list[str] | None) -> list[str]:
@@ -81,5 +84,5 @@ def _load(
     except ConfigError as error:
         load_config(path, overrides, new_rig=new_rig)  # raises if the command's own options are not to blame
         wrong = [key for key, _ in given if repr(key) in str(error)] or [key for key, _ in given]
-        names = ", ".join("--" + key.rpartition(".")[2].replace("_", "-") for key in wrong)
+        names = ", ".join(_NAMES.get(key) or "--" + key.rpartition(".")[2].replace("_", "-") for key in wrong)
         raise ConfigError(str(error).replace("(from --set)", f"(from {names})")) from None

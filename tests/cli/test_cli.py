@@ -775,6 +775,7 @@ def test_options_win_over_overrides() -> None:
         (["target_n=2"], {"seed": -1, "target_n": 3.0}, r"'seed' \(from --seed\)"),
         (["seed=-1"], {"target_n": 3.0}, r"'seed' \(from --set\)"),
         (None, {"control.feedback": "sight"}, r"'control\.feedback' \(from --feedback\)"),
+        (None, {"sim.yaw_deg": 91.0}, r"'sim\.yaw_deg' \(from --degrees\)"),
     ],
 )
 def test_an_error_names_the_option_that_is_wrong(

@@ -322,4 +322,4 @@ def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:
     end = CliRunner().invoke(app, arguments)
     assert isinstance(end.exception, ConfigError)
     assert "this needs a person at a terminal: Put the load cell" in str(end.exception)
-    assert str(end.exception).endswith("if it is done, pass --yes")
+    assert str(end.exception).endswith("; run it in a terminal, or pass --yes if it is done")
