@@ -160,9 +160,7 @@ class ForceEstimator:
         forces: list[float] = step.forces_n.tolist()
         self._attention = step.attention
         if not all(math.isfinite(force) for force in forces):
-            raise NonFiniteError(
-                f"the network returned {forces} N; check the checkpoint and the camera's image"
-            )
+            raise NonFiniteError(f"the network returned {forces} N; check the checkpoint and the image")
         force_n = sum(forces) / len(forces)
         features, score = step.features[None], 0.0  # (1, F)
         if self._ood is not None:
@@ -213,12 +211,17 @@ def claimed_std_n(header: Header, forces_n: npt.NDArray[np.floating]) -> npt.NDA
 def open_estimator(
     model: Model, vision: VisionConfig, correction: Correction | None = None, *, set_threads: bool = True
 ) -> ForceEstimator:
-    """Returns the estimator that a configuration describes.
+    """Returns the estimator that a configuration describes; see `open_configured_engine`."""
+    engine = open_configured_engine(model, vision, set_threads=set_threads)
+    return ForceEstimator(engine, vision.region, correction, vision.max_covered)
+
+
+def open_configured_engine(model: Model, vision: VisionConfig, *, set_threads: bool = True) -> Engine:
+    """Returns the engine that a configuration describes.
 
     Args:
         model: The network that ``vision.checkpoint`` names.
         vision: Configuration without ``auto``; see `gripper_force.vision.selection.resolve_auto`.
-        correction: Correction by an object profile.
         set_threads: Sets PyTorch's threads, one setting of the whole process, to ``vision.threads``. OpenVINO
             and ONNX Runtime have their own threads and use that number in any case.
 
@@ -227,8 +230,7 @@ def open_estimator(
         CheckpointError: The file is damaged.
     """
     threads = None if vision.engine == "torch" and not set_threads else vision.threads
-    engine = open_engine(model, vision.engine, vision.precision, threads)
-    return ForceEstimator(engine, vision.region, correction, vision.max_covered)
+    return open_engine(model, vision.engine, vision.precision, threads)
 
 
 def _profile_correction(model: Model, name: str) -> Correction:

@@ -32,8 +32,11 @@ from gripper_force.jobs.recording.record import RecordingPlan, check_name, recor
 from gripper_force.jobs.trials import with_same_object
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
+from gripper_force.runtime.process import allowed_options
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
-from gripper_force.vision.engines import open_engine
+from gripper_force.vision.engines import Engine
+from gripper_force.vision.estimator import open_configured_engine
+from gripper_force.vision.header import Model
 from gripper_force.vision.stream_inference import features
 
 TOUCHES: Final = 8
@@ -174,17 +177,14 @@ def check_before_touches(config: Config, name: str, out: str | Path | None = Non
     """Checks what a calibration needs before the first touch. Returns the path of the profile.
 
     Raises:
-        ConfigError: There is no network to correct, the name can't be part of a file name, or the profile can't be
-            written.
+        ConfigError: There is no network to correct, its engine can't run it, the name can't be part of a file name, or
+            the profile can't be written.
         CheckpointError: The network can't be read.
     """
     check_name(name)
     path = user_folder() / f"{name}.yaml" if out is None else Path(out)
     check_object_place(path)
-    if resolve_vision(config)[1] is None:
-        raise ConfigError(
-            "calibrate object corrects a network, but vision.checkpoint is none; name a network, such as default"
-        )
+    _open_network(config)
     return path
 
 
@@ -266,13 +266,22 @@ def _plan(touches: int, peak_n: float | None) -> RecordingPlan:
     return RecordingPlan(touches, touches=1, peak_n=peak_n, test_every=None)
 
 
+def _open_network(config: Config) -> tuple[Config, Model, Engine]:
+    """Returns the configuration without ``auto``, the network to correct, and its engine."""
+    config, model, _ = resolve_vision(config)
+    if model is None:
+        raise ConfigError(
+            "calibrate object corrects a network, but vision.checkpoint is none; name a network, such as default"
+        )
+    set_threads = allowed_options().torch_threads
+    return config, model, open_configured_engine(model, config.vision, set_threads=set_threads)
+
+
 def _fit_and_write(
     config: Config, name: str, paths: Sequence[Path], out: Path, progress: Progress
 ) -> ObjectCalibration:
-    config, model, _ = resolve_vision(config)
-    assert model is not None  # as checked before the touches
-    vision = config.vision
-    run = partial(features, open_engine(model, vision.engine, vision.precision, vision.threads))
+    config, model, engine = _open_network(config)
+    run = partial(features, engine)
     recordings = {}
     for path in sorted(paths, key=started_ns):  # the order shows after which touch the object stayed narrower
         recordings[path] = read_log(path, model.header.preprocess, run)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner, Result
 
 from gripper_calibration import touch_logs
@@ -129,6 +130,24 @@ def test_calibration_needs_no_pytorch() -> None:
     code = "import sys, gripper_calibration.procedures.calibrate_object; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"torch", "gripper_force.vision.export"} & set(done.stdout.split())
+
+
+def test_an_engine_that_can_not_run_is_named_before_the_touches(tmp_path: Path) -> None:
+    config = load_config(None, [*QUICK, "vision.engine=pathlib:Path"])
+    with pytest.raises(ConfigError, match=r"vision\.engine=pathlib:Path: .* has no method 'step'"):
+        calibrate_object(config, "stapler", touches=1, folder=tmp_path, out=tmp_path / "it.yaml")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("library_process")
+def test_the_threads_of_pytorch_are_the_programs() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(before + 1)
+    try:
+        job.check_before_touches(load_config(None, [*QUICK, "vision.engine=torch"]), "stapler")
+        assert torch.get_num_threads() == before + 1
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_log_is_read_once_with_the_results_of_separate_reads(
