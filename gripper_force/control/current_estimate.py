@@ -6,6 +6,7 @@ from typing import Final
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.free_travel import FREE_NOISE_N, FreeTravel
+from gripper_force.control.speed_limit import hold_speed_m_s
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import NS_PER_S, ServoState
 
@@ -15,9 +16,9 @@ FREE_FLOOR_N: Final = 0.08
 _LOWERING_LAG_SHARE = 0.1
 """Lag of the motor force while the force is lowered, as a share of the plant's."""
 
-_SLIDES_SHARE = 0.2
-"""Jaws that close faster than this share of the approach speed during a steady hold have lost their object. The motor
-force alone does not show it if the object returns at once, because it then stays within the play."""
+_SLIDES_SHARE = 0.4
+"""Jaws that close faster than this share of a hold's speed during a steady hold have lost their object. The motor force
+alone does not show it if the object returns at once, because it then stays within the play."""
 
 
 class CurrentEstimate:
@@ -40,7 +41,7 @@ class CurrentEstimate:
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         _, self.lag_s, _ = config.plant
-        self._slides_m_s = _SLIDES_SHARE * config.approach_speed_m_s
+        self._slides_m_s = _SLIDES_SHARE * hold_speed_m_s(config, transmission)
         self._transmission = transmission
         cycles = math.ceil(config.rate_hz * config.max_frame_age_ms / 1e3) + 2
         self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # covers the age of any accepted frame

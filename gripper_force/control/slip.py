@@ -2,15 +2,15 @@
 
 from gripper_force.config import ControlConfig
 
-_FREE_SPEED_SHARE = 0.2
+_FREE_SPEED_SHARE = 0.4
 _SHORTFALL_SHARE = 0.5
 _SHORTFALL_N = 0.2
 _FREE_S = 0.015
 _FREE_FILTER_S = 0.015
-"""Free closing: the closing speed is above `_FREE_SPEED_SHARE` of the approach speed, and the motor force falls short
-of its goal by more than `_SHORTFALL_SHARE` of the reference and `_SHORTFALL_N`, both for `_FREE_S`. The jaws then
-press on nothing. Speed and shortfall are filtered: the speed limit brakes jaws without resistance in every second
-cycle."""
+"""Free closing: the closing speed is above `_FREE_SPEED_SHARE` of the largest one in a hold, and the motor force falls
+short of its goal by more than `_SHORTFALL_SHARE` of the reference and `_SHORTFALL_N`, both for `_FREE_S`. The jaws
+then press on nothing. Speed and shortfall are filtered: the speed limit may brake jaws without resistance in every
+second cycle."""
 
 _RECEDED_M = 0.0005
 _RECEDED_FORCE_N = 0.1
@@ -23,10 +23,16 @@ _COLLAPSE_S = 0.1
 
 
 class SlipMonitor:
-    """Watches the jaws of a grip."""
+    """Watches the jaws of a grip.
 
-    def __init__(self, config: ControlConfig) -> None:
+    Args:
+        config: Widths that are a slip or no object.
+        hold_m_s: Largest closing speed of one jaw in a hold.
+    """
+
+    def __init__(self, config: ControlConfig, hold_m_s: float) -> None:
         self._config = config
+        self._closes_m_s = _FREE_SPEED_SHARE * hold_m_s
         self.start()
 
     def start(self) -> None:
@@ -85,7 +91,7 @@ class SlipMonitor:
         return ""
 
     def _closes(self, closing_m_s: float) -> bool:
-        return closing_m_s > _FREE_SPEED_SHARE * self._config.approach_speed_m_s
+        return closing_m_s > self._closes_m_s
 
     def slip_reason(
         self, dt_s: float, force_n: float, target_n: float, closed_m: float, closing_m_s: float

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 
+from gripper_force.config import ControlConfig
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import ServoCommand, ServoState
 
@@ -13,8 +14,15 @@ the wanted one."""
 _UNKNOWN_LEAD_M = 0.002
 """Lead of one jaw with a servo whose position loop is unknown."""
 
+_HOLD_SHARE = 0.5
+"""Largest closing speed of a hold, as a share of the approach speed."""
+
 _OVERSPEED = 1.4
 """Multiple of the wanted speed above which the servo brakes."""
+
+_RESISTED = 2.0
+"""Multiple of the measured current up to which the lead follows the goal current. Jaws that are blocked come to their
+goal current even if the servo draws only half of what its data say, or if one of two fingers is blocked alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,31 +38,33 @@ class PositionLoop:
     gain_per_s: float
 
 
+def hold_speed_m_s(config: ControlConfig, transmission: Transmission) -> float:
+    """Returns the largest speed of one jaw in a hold: its object may return to jaws that close."""
+    return min(_HOLD_SHARE * config.approach_speed_m_s, transmission.impact_m_s(config.force_limit_n))
+
+
 class SpeedLimit:
     """Keeps the goal position so close to the present position that the servo cannot be too fast.
 
     The servo's position loop sets the motor's voltage in proportion to that lead, and back-EMF bounds the speed
-    at this voltage. So the limit holds inside the servo, between two cycles, too. The lead is never shorter
-    than the goal current needs at rest: the current alone sets the force of a grip.
+    at this voltage. So the limit holds inside the servo, between two cycles, too. Where something resists, the lead is
+    not shorter than the goal current needs at rest: the current alone sets the force of a grip. Jaws that nothing
+    resists draw far less than their goal. So they get the lead of the wanted speed only: with that of the goal
+    current they would be too fast again in the cycle after each brake.
     """
 
     def __init__(self, transmission: Transmission, loop: PositionLoop | None) -> None:
         self._transmission, self._loop = transmission, loop
 
-    def apply(
-        self, command: ServoCommand, servo: ServoState, speed_m_s: float, opening_a: float = math.inf
-    ) -> ServoCommand:
-        """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``.
-
-        To open, the lead allows no more current than ``opening_a`` at rest.
-        """
+    def apply(self, command: ServoCommand, servo: ServoState, speed_m_s: float) -> ServoCommand:
+        """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``."""
         distance_rad = command.goal_position_rad - servo.position_rad
         moving_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
         ahead = distance_rad * servo.velocity_rad_s > 0
         if ahead and abs(moving_m_s) > _OVERSPEED * speed_m_s:
             return replace(command, goal_position_rad=servo.position_rad)
-        opens = distance_rad * self._transmission.closing_sign < 0
-        rest_a = min(command.goal_current_a, opening_a) if opens else command.goal_current_a
+        resisted_a = _RESISTED * math.copysign(servo.current_a, servo.current_a * distance_rad)
+        rest_a = min(command.goal_current_a, resisted_a)
         lead_rad = self._lead_rad(rest_a, servo.position_rad, speed_m_s)
         bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
         return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
@@ -66,9 +76,9 @@ class SpeedLimit:
         error_rad = _SPARE * abs(current_a) / self._loop.a_per_rad
         return 2 * error_rad * self._transmission.jaw_m_per_rad(position_rad)
 
-    def _lead_rad(self, goal_current_a: float, position_rad: float, speed_m_s: float) -> float:
+    def _lead_rad(self, rest_a: float, position_rad: float, speed_m_s: float) -> float:
         rad_per_m = 1 / self._transmission.jaw_m_per_rad(position_rad)
         if self._loop is None:
             return _UNKNOWN_LEAD_M * rad_per_m
         moving_rad = speed_m_s * rad_per_m / self._loop.gain_per_s
-        return _SPARE * max(moving_rad, goal_current_a / self._loop.a_per_rad)
+        return _SPARE * max(moving_rad, rest_a / self._loop.a_per_rad)

@@ -13,7 +13,7 @@ from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import SafetyLatch, is_plausible
 from gripper_force.control.slip import SlipMonitor
-from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
+from gripper_force.control.speed_limit import PositionLoop, SpeedLimit, hold_speed_m_s
 from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
 from gripper_force.control.travel import Travel
 from gripper_force.control.visual_check import VisualCheck
@@ -35,9 +35,6 @@ from gripper_force.types import (
 
 MAX_CYCLE_S = 0.05
 """Longest cycle time that is used, so that a late cycle does not cause a jump of the command."""
-
-_HOLD_SPEED_SHARE = 0.5
-"""Largest closing speed during hold, as a share of the approach speed."""
 
 _TRAVEL_SPEED_SHARE = 2.0
 """Speed of a release or move, as a share of the approach speed."""
@@ -146,7 +143,8 @@ class GraspController:
         self._friction = FrictionAllowance(config, transmission)
         self._safety = SafetyLatch(config)
         self._approach = Approach(config, transmission, approach_m_s)
-        self._slip = SlipMonitor(config)
+        self._hold_m_s = hold_speed_m_s(config, transmission)
+        self._slip = SlipMonitor(config, self._hold_m_s)
         self._visual_check = VisualCheck(config)
         self._largest_target_n = largest_target_n(config.force_limit_n, transmission.torque_constant_bound)
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
@@ -418,12 +416,12 @@ class GraspController:
     @property
     def _speed_m_s(self) -> float:
         """Largest speed of one jaw in the present phase."""
-        full_m_s = self._config.approach_speed_m_s
         if self._is_opening or self._phase in (Phase.MOVE, Phase.OPEN):
             return self._travel.speed_m_s
         if self._phase == Phase.APPROACH:
             return self._approach.speed_m_s
-        return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else _HOLD_SPEED_SHARE * full_m_s
+        is_rising = self._phase in (Phase.CONTACT, Phase.RAMP)
+        return self._config.approach_speed_m_s if is_rising else self._hold_m_s
 
     @property
     def _derated_target_n(self) -> float:
@@ -696,8 +694,7 @@ class GraspController:
             opening=self._is_opening,
         )
         if self._servo is not None:
-            free_a = self._transmission.current_a(self._travel.free_motor_force_n, self._present_rad)
-            command = self._speed_limit.apply(command, self._servo, self._speed_m_s, abs(free_a))
+            command = self._speed_limit.apply(command, self._servo, self._speed_m_s)
         return command, is_over
 
     def _status(self, t_ns: int) -> GraspStatus:

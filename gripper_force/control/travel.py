@@ -60,11 +60,6 @@ class Travel:
         self._profile.start(width_m, self.speed_m_s)
         self._grip_n, self._push_n = grip_n, 0.0
 
-    @property
-    def free_motor_force_n(self) -> float:
-        """Motor force of jaws without an object: the configured one, and what slow jaws were found to need."""
-        return self._free_motor_force_n + self._push_n
-
     def open(self, dt_s: float, t_s: float, width_m: float, closing_m_s: float) -> None:
         """Runs one cycle of a release.
 

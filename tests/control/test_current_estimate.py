@@ -46,6 +46,21 @@ def test_jaws_that_slide_in_a_hold_have_lost_their_object(press, transmission):
     assert press(motor_force_n, holding=True, closing_m_s=0.02).force_n == pytest.approx(0.0, abs=0.01)
 
 
+def test_jaws_that_slide_slowly_have_lost_it_if_the_force_limit_makes_them_slow(transmission):
+    for limit_n, slides in ((14.0, False), (1.0, True)):
+        current = CurrentEstimate(ControlConfig(force_limit_n=limit_n), transmission)
+        velocity_rad_s = 0.003 / transmission.closing_m_s(1.0, 0.0)
+        current_a = transmission.current_a(transmission.friction_n, 0.0)
+        current.force_n = 2 * transmission.friction_n
+        current.step(
+            ServoState(0, 0.0, velocity_rad_s, current_a, 30.0, 12.0, 0),
+            free=False,
+            holding=True,
+            lowering=False,
+        )
+        assert (current.force_n < 0.1) == slides
+
+
 def test_a_lowered_force_is_followed_with_less_lag(press, transmission):
     steady_n = press(3.0 + transmission.friction_n).force_n
     followed_n = press(-transmission.friction_n, cycles=3, lowering=True).force_n

@@ -4,15 +4,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gripper_force.control.speed_limit import SpeedLimit
+from gripper_force.config import ControlConfig
+from gripper_force.control.speed_limit import SpeedLimit, hold_speed_m_s
 from gripper_force.qualification.loop_margin.analytic_plant import POSITION_LOOP, Gripper
 from gripper_force.types import ServoCommand, ServoState
 
 RADIUS_M = 0.020
 
 
-def reading(position_rad=0.0, velocity_rad_s=0.0):
-    return ServoState(0, position_rad, velocity_rad_s, 0.0, 30.0, 12.0, 0)
+def reading(position_rad=0.0, velocity_rad_s=0.0, current_a=0.0):
+    return ServoState(0, position_rad, velocity_rad_s, current_a, 30.0, 12.0, 0)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.005, 0.0125, 0.025, 0.05])
@@ -36,8 +37,30 @@ def test_speed_is_bounded_for_any_current_and_friction(
 
 @pytest.mark.parametrize("current_a", [0.02, 0.1, 0.3])
 def test_lead_never_lowers_the_current_of_jaws_at_rest(transmission, current_a):
-    command = SpeedLimit(transmission, POSITION_LOOP).apply(ServoCommand(0, 9.0, current_a), reading(), 0.001)
+    rests = reading(current_a=0.7 * current_a)  # a hot motor, or the supply voltage, may lower it
+    command = SpeedLimit(transmission, POSITION_LOOP).apply(ServoCommand(0, 9.0, current_a), rests, 0.001)
     assert command.goal_position_rad * POSITION_LOOP.a_per_rad > 1.2 * current_a
+
+
+@pytest.mark.parametrize("direction", [-1, 1])
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_blocked_jaws_come_to_their_goal_current(transmission, direction, share):
+    # The servo may draw less at the same lead than its data say.
+    limit, current_a = SpeedLimit(transmission, POSITION_LOOP), 0.0
+    for _ in range(20):
+        command = limit.apply(ServoCommand(0, direction * 9.0, 0.5), reading(current_a=current_a), 0.005)
+        drawn_a = share * command.goal_position_rad * POSITION_LOOP.a_per_rad
+        current_a = math.copysign(min(abs(drawn_a), 0.5), drawn_a)
+    assert direction * current_a == pytest.approx(min(0.5, 1.3 * share * 0.5))
+
+
+@pytest.mark.parametrize("current_a", [0.0, -0.1])
+def test_jaws_that_nothing_resists_do_not_get_the_lead_of_a_grip(transmission, current_a):
+    # The brake has just stopped them. With the lead of the goal current they were too fast in every second cycle.
+    command = SpeedLimit(transmission, POSITION_LOOP).apply(
+        ServoCommand(0, 9.0, 0.5), reading(current_a=current_a), 0.01
+    )
+    assert RADIUS_M * POSITION_LOOP.gain_per_s * command.goal_position_rad == pytest.approx(1.3 * 0.01)
 
 
 def test_servo_brakes_above_the_speed(transmission):
@@ -70,11 +93,14 @@ def test_goal_lies_between_present_and_wanted_position(
     assert math.isfinite(command.goal_position_rad)
 
 
-def test_to_open_the_lead_goes_by_the_current_of_free_travel(transmission):
-    limit = SpeedLimit(transmission, POSITION_LOOP)
+def test_to_open_the_lead_does_not_go_by_the_current_of_the_grip(transmission):
+    grips, wanted = reading(current_a=0.5), ServoCommand(0, -9.0, 0.5)
+    command = SpeedLimit(transmission, POSITION_LOOP).apply(wanted, grips, 0.001)
+    assert RADIUS_M * POSITION_LOOP.gain_per_s * command.goal_position_rad == pytest.approx(-1.3 * 0.001)
 
-    def lead_rad(goal_rad, *free_a):
-        return abs(limit.apply(ServoCommand(0, goal_rad, 0.5), reading(), 0.001, *free_a).goal_position_rad)
 
-    assert lead_rad(-9.0, 0.05) == pytest.approx(0.1 * lead_rad(-9.0), rel=0.2)
-    assert lead_rad(9.0, 0.05) == lead_rad(9.0) == lead_rad(-9.0)
+def test_a_hold_is_slower_with_a_small_force_limit(transmission):
+    assert hold_speed_m_s(ControlConfig(), transmission) == 0.0125
+    assert (
+        hold_speed_m_s(ControlConfig(force_limit_n=1.0), transmission) == transmission.impact_m_s(1.0) < 0.004
+    )
