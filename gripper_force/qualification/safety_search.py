@@ -105,7 +105,7 @@ class Draw:
         friction: True friction over the configured one.
         gain: True torque constant over the configured one.
         stiffness_n_m: Stiffness of the object at one jaw.
-        mass_kg: Mass of a jaw with its half of the rotor.
+        mass_kg: Mass of a jaw with its half of the rotor, or with its own rotor.
         damping_n_s_m: Viscous friction.
         play_m: Gear play in each direction.
         contact_m: Travel of a jaw at which it meets the object; 1 m without an object.
@@ -229,7 +229,7 @@ class _Random:
         return value if self.generator.uniform() < share else otherwise
 
 
-def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> Draw:
+def draw(config: ControlConfig, truth: Transmission, seed: int, index: int, servos: int = 1) -> Draw:
     """Draws a case. The same arguments give the same case.
 
     Args:
@@ -237,10 +237,12 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         truth: The gripper.
         seed: Seed of all draws.
         index: Number of the case.
+        servos: 2 if each jaw has its own servo.
     """
     random = _Random(seed, index)
     is_sequence = index % _SEQUENCE == _SEQUENCE - 2
     drawn = _draw_far(random, config, truth, is_sequence=is_sequence)
+    drawn = replace(drawn, mass_kg=servos * drawn.mass_kg)  # of one servo, a jaw has half
     if index % _NEAR == _STREAM_REMAINDER:
         max_n = largest_target_n(drawn.force_limit_n, truth.torque_constant_bound)
         return replace(drawn, requests=tuple(_draw_stream(random, max_n, truth.open_width_m)))
@@ -334,11 +336,12 @@ def _move_near(random: _Random, drawn: Draw, open_width_m: float) -> Draw:
 def run_case(config: Config, seed: int, index: int) -> CaseResult:
     """Grasps and releases with one drawn plant, in closed loop with the unmodified controller."""
     refused = CaseResult(index, "refused", 0.0, 0.0, held_nothing=False, held_stop=False)
-    truth = transmission_of(config.gripper)
-    drawn = draw(config.control, truth, seed, index)
+    servos = len(config.servo.ids)
+    truth = transmission_of(config.gripper, servos)
+    drawn = draw(config.control, truth, seed, index, servos)
     width_m = drawn.width * truth.open_width_m
     try:
-        believed = transmission_of(config.gripper.model_copy(update={"open_width_m": width_m}))
+        believed = transmission_of(config.gripper.model_copy(update={"open_width_m": width_m}), servos)
     except ConfigError:  # the linkage cannot close so far
         return refused
     control = config.control.model_copy(
@@ -543,7 +546,9 @@ def _report(config: Config, results: list[CaseResult]) -> SearchReport:
         for result in sorted(results, key=key, reverse=True)[:WORST]:
             if name == "held nothing" and not result.held_nothing:
                 return
-            drawn = asdict(draw(config.control, transmission_of(config.gripper), config.seed, result.index))
+            servos = len(config.servo.ids)
+            truth = transmission_of(config.gripper, servos)
+            drawn = asdict(draw(config.control, truth, config.seed, result.index, servos))
             finite = {
                 k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in drawn.items()
             }

@@ -35,9 +35,9 @@ NOISE_A: Final = 0.003
 """Standard deviation of the measured current in one reading."""
 
 
-def transmission_of(gripper: GripperConfig) -> Transmission:
-    """Returns the configured transmission; motor data that are not configured are an XM430-W350's."""
-    return Transmission.from_config(gripper, _NM_PER_A, gripper.current_step_a or CURRENT_STEP_A)
+def transmission_of(gripper: GripperConfig, servos: int = 1) -> Transmission:
+    """Returns the configured transmission; motor data that are not configured are those of XM430-W350 servos."""
+    return Transmission.from_config(gripper, servos * _NM_PER_A, gripper.current_step_a or CURRENT_STEP_A)
 
 
 @dataclass(slots=True)
@@ -53,7 +53,7 @@ class Gripper:
         damping_n_s_m: True viscous friction.
         play_m: Gear play in each direction.
         step_a: True resolution of the goal current.
-        mass_kg: Mass of an open jaw with its half of the rotor, which a linkage multiplies as it closes.
+        mass_kg: Mass of an open jaw with its half of the rotor, or its own rotor. A linkage multiplies it as it closes.
         contact_m: Travel at which the jaw meets the object.
         stops_m: Travel of the motor at its two end stops, at which it comes to rest.
         x_m: Travel of the motor, as travel of a jaw.
