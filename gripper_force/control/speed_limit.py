@@ -64,8 +64,7 @@ class SpeedLimit:
         if ahead and abs(moving_m_s) > _OVERSPEED * speed_m_s:
             return replace(command, goal_position_rad=servo.position_rad)
         resisted_a = _RESISTED * math.copysign(servo.current_a, servo.current_a * distance_rad)
-        rest_a = min(command.goal_current_a, resisted_a)
-        lead_rad = self._lead_rad(rest_a, servo.position_rad, speed_m_s)
+        lead_rad = self._lead_rad(min(command.goal_current_a, resisted_a), servo.position_rad, speed_m_s)
         bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
         return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
 
