@@ -101,9 +101,10 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
     missing = [method for method in _METHODS.get(group, ()) if not hasattr(found, method)]
     if isinstance(found, type) and missing:
+        interface = "vision.engines.Engine" if group == "engines" else "interfaces"
         raise ConfigError(
-            f"{key}={name}: {target} has no method {missing[0]!r}; name a class with the methods of the "
-            "interface in gripper_force.interfaces"
+            f"{key}={name}: {target} has no method {missing[0]!r}; name a class with the methods that "
+            f"gripper_force.{interface} describes"
         )
     if name in builtin:
         return found

@@ -1,3 +1,4 @@
+import re
 from copy import copy
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -39,13 +40,17 @@ def test_finds_builtin_registered_and_named_classes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("group", "method"),
-    [("servos", "spec"), ("cameras", "newest"), ("load_cells", "drain"), ("engines", "step")],
+    ("group", "method", "interface"),
+    [
+        ("servos", "spec", "interfaces"),
+        ("cameras", "newest", "interfaces"),
+        ("load_cells", "drain", "interfaces"),
+        ("engines", "step", "vision.engines.Engine"),
+    ],
 )
-def test_a_class_of_another_kind_is_refused(group: str, method: str) -> None:
-    with pytest.raises(
-        ConfigError, match=rf"^x\.backend=pathlib:Path: pathlib:Path has no method '{method}'"
-    ):
+def test_a_class_of_another_kind_is_refused(group: str, method: str, interface: str) -> None:
+    found = f"x.backend=pathlib:Path: pathlib:Path has no method '{method}'; "
+    with pytest.raises(ConfigError, match=re.escape(found) + rf".* gripper_force\.{interface} describes$"):
         load_class(group, {}, "pathlib:Path", "x.backend")
 
 
