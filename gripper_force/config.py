@@ -719,10 +719,10 @@ def load_config(
     """
     where = str(path) if path else "--set"
     tree = {} if path is None else read_tree(as_path(path, "the configuration", "or pass keys and values"))
-    if "format" in tree:
+    if not tree.keys().isdisjoint({"format", "family"}):
         raise ConfigError(
-            f"{path} is a {tree['format']} file, not a configuration; pass a rig profile with --set "
-            f"calibration.rig={path}, or an object profile with --profile {path}"
+            f"{path} is not a configuration; pass a rig profile with --set calibration.rig={path}, an object "
+            f"profile with --profile {path}, or a simulated object with --object {path}"
         )
     return _with_overrides(
         lambda given: merged(_rig_settings(given, where, new_rig), given), tree, where, overrides

@@ -129,11 +129,13 @@ def test_who_is_wrong_is_named_the_file_or_what_is_set(tmp_path: Path) -> None:
     assert load_config(path, ["seed=3"]).seed == 3
 
 
-def test_a_rig_profile_is_no_configuration(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["format: gripper-force-rig/1", "family: solid"])
+def test_a_profile_or_an_object_is_no_configuration(text: str, tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    path.write_text("format: gripper-force-rig/1")
+    path.write_text(text)
     with pytest.raises(
-        ConfigError, match=r"rig\.yaml is a gripper-force-rig.* not a configuration.* --set calibration\.rig="
+        ConfigError,
+        match=r"rig\.yaml is not a configuration.* --set calibration\.rig=.* --profile .* --object ",
     ):
         load_config(path)
 
