@@ -243,6 +243,7 @@ def test_a_servo_whose_start_returns_nothing_is_told_to_stop(
 def test_an_engine_and_a_module_that_fail_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_engine.py").write_text(
         "class Engine:\n    def __init__(self, *_): 1 / 0\n    def step(self, frame): ...\n"
+        "    def warm_up(self): ...\n"
     )
     (tmp_path / "own_module.py").write_text("1 / 0")
     monkeypatch.syspath_prepend(tmp_path)

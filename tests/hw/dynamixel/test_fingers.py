@@ -109,7 +109,7 @@ def test_wrong_pairs_are_refused() -> None:
     for sets, text in (
         (["servo.second.id=1"], r"second\.id 1 is servo\.id"),
         (["servo.second.id=2", "gripper.linkage={kind: finger, finger_m: 0.06}"], "set the kind to fingers"),
-        (["faults=[{unit: servo, kind: off, id: 2}]"], "no servo of the gripper"),
+        (["faults=[{unit: servo, kind: off, id: 2}]"], "no servo has it"),
         (["servo.second.id=2", "faults=[{unit: bus, kind: off, id: 2}]"], "bus has no id"),
     ):
         with pytest.raises(ConfigError, match=text):

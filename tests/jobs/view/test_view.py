@@ -207,7 +207,7 @@ def test_what_is_no_log_is_refused_while_it_is_followed(tmp_path: Path) -> None:
         foreign = Writer(file)
         foreign.start()
         foreign.finish()
-    with pytest.raises(LogError, match="it holds no configuration"):
+    with pytest.raises(LogError, match="holds no configuration"):
         view.GrowingLog(path, wait)
 
 
