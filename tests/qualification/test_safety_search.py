@@ -17,8 +17,8 @@ from gripper_force.control.visual_check import VisualCheck
 from gripper_force.errors import DataError
 from gripper_force.qualification import safety_search
 from gripper_force.qualification.loop_margin.analytic_plant import transmission_of
-from gripper_force.qualification.safety_search import SearchReport, draw, run_case, search
-from gripper_force.types import ServoCommand
+from gripper_force.qualification.safety_search import SearchReport, TimedRequest, draw, run_case, search
+from gripper_force.types import RequestKind, ServoCommand
 
 GRIPPERS = Path(__file__).parents[2] / "examples" / "grippers"
 RACK = transmission_of(load_config(None).gripper)
@@ -238,9 +238,11 @@ def test_command_reports_violations_with_exit_code_1(tmp_path: Path, monkeypatch
     bad = replace(run_case(config, 0, 3), force_share=1.2)
     found = safety_search._report(config, [run_case(config, 0, 2), bad])
     assert (found["ok"], found["violations"]["force"], found["worst"]["force"][0]["index"]) == (False, 1, 3)
+    found["worst"]["force"][0]["drawn"]["requests"] = [TimedRequest(0.05, RequestKind.GRASP, 2.0)] * 100
     monkeypatch.setattr(safety_search, "search", run)
     call = ["stability", "search", "--cases", "2", "--set", f"log.directory={tmp_path}"]
     done = CliRunner().invoke(app, call)
     assert done.exit_code == 1
     assert "force: 1 of 2" in done.stdout
+    assert "grasp 2 for 0.05 s; 100 in all" in done.stdout
     assert json.loads(CliRunner().invoke(app, [*call, "--json"]).stdout)["violations"]["force"] == 1

@@ -1,6 +1,6 @@
 """Tables of the `stability` commands."""
 
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Final, TypedDict, cast
 
 from rich.markup import escape
 from rich.table import Table
@@ -8,12 +8,18 @@ from rich.table import Table
 from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from gripper_force.qualification.fault_matrix.matrix import RowSummary
     from gripper_force.qualification.fault_matrix.wrong_configurations import WrongSummary
     from gripper_force.qualification.fuzz.fuzzer import FuzzReport
     from gripper_force.qualification.numerics.suite import NumericsReport
-    from gripper_force.qualification.safety_search import SearchReport
+    from gripper_force.qualification.safety_search import SearchReport, TimedRequest
     from gripper_force.qualification.soak import SoakReport
+
+
+_SHOWN: Final = 8
+"""Requests of a case that are printed. A stream has a hundred."""
 
 
 class FaultsReport(TypedDict):
@@ -119,9 +125,12 @@ def search_table(r: "SearchReport") -> None:
         colour = "bold red" if found else "green"
         out.print(f"{name}: [{colour}]{found} of {r['cases']}[/]")
         for case in cases:
-            drawn = ", ".join(f"{key} {number(value)}" for key, value in case["drawn"].items())
+            requests = cast("Sequence[TimedRequest]", case["drawn"]["requests"])
+            values = {**case["drawn"], "requests": _requests(requests)}
+            drawn = ", ".join(f"{key} {number(value)}" for key, value in values.items())
+            outcome = case["outcome"] or "not ended"
             out.print(
-                f"  case {case['index']}, {case['outcome']}: {case['force_share']:.2f} of the force limit, "
+                f"  case {case['index']}, {outcome}: {case['force_share']:.2f} of the force limit, "
                 f"{case['speed_share']:.2f} of the speed\n    [dim]{escape(drawn)}[/]",
                 soft_wrap=True,
             )
@@ -132,6 +141,12 @@ def search_table(r: "SearchReport") -> None:
             "seed": r["seed"],
         }
     )
+
+
+def _requests(requests: "Sequence[TimedRequest]") -> str:
+    """Returns the first requests of a case as text, each with the time until the next one, and the number of all."""
+    shown = "; ".join(f"{one.kind} {one.value:.3g} for {one.time_s:.2f} s" for one in requests[:_SHOWN])
+    return f"{shown}; {len(requests)} in all" if len(requests) > _SHOWN else shown or "-"
 
 
 def soak_table(r: "SoakReport") -> None:
