@@ -27,6 +27,7 @@ def logs(fused_log: Path, tmp_path: Path) -> Path:
 @pytest.mark.filterwarnings("default")  # of Ray
 def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay_bench, "COMMANDS", ("replay", "evaluate --set vision.precision=bfloat16"))
+    monkeypatch.setattr(replay_bench, "bfloat16_instructions", lambda: "amx_bf16")
     page = tmp_path / "page.md"
     page.write_text("<!-- rates -->\n<!-- end of rates -->\n")
     call = ["bench", "replay", "--logs", str(logs), "--checkpoint", "small", "--rounds", "1", "--jobs", "2"]
@@ -55,6 +56,17 @@ def test_the_table_has_the_median_and_the_range_of_the_rounds() -> None:
         "",
         "About it.",
     ]
+
+
+@pytest.mark.parametrize("instructions", ["", "avx512_bf16"])
+def test_bfloat16_is_measured_where_the_cpu_computes_in_it(
+    instructions: str, logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replay_bench, "bfloat16_instructions", lambda: instructions)
+    monkeypatch.setattr(replay_bench, "_run", lambda arguments: {"mae_n": 0.1})
+    rows = replay_bench.bench(logs, ["small"], 2, 1, lambda _: None)
+    expected = replay_bench.COMMANDS if instructions else replay_bench.COMMANDS[:2]
+    assert tuple(dict.fromkeys(row.command for row in rows)) == expected
 
 
 def test_ways_that_disagree_are_an_error(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
