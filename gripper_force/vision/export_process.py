@@ -1,4 +1,4 @@
-"""Export of a checkpoint in a process of its own: exporters print, warn, log, and set PyTorch's threads.
+"""Export of a checkpoint in a separate process: exporters print, warn, log, and set PyTorch's threads.
 
 The process runs this module, with the paths of checkpoint and file.
 """
@@ -20,7 +20,7 @@ from gripper_force.vision.model_files import read_model
 
 
 def export_apart(model: Model, path: Path) -> None:
-    """Writes an ensemble's streaming step as `gripper_force.vision.export.export` does, in a process of its own.
+    """Writes an ensemble's streaming step as `gripper_force.vision.export.export` does, in a separate process.
 
     Args:
         model: The checkpoint.
@@ -54,7 +54,7 @@ def export_apart(model: Model, path: Path) -> None:
 def _run(*arguments: str) -> tuple[int, str]:
     """Runs this module. Returns the exit code, and what it has said. The process ends with this one, or with the call.
 
-    It is a session of its own, because the terminal's Ctrl-C is meant for this process.
+    It runs in its own session, because the terminal's Ctrl-C is meant for this process.
     """
     command = [sys.executable, "-P", "-m", __name__, *arguments]
     paths = {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -1015,6 +1015,21 @@ def test_ctrl_c_in_a_call_that_waits_leaves_jaws_that_grip(
         gripper.grasp(2.0)
     time.sleep(0.1)
     assert gripper.state.phase == gf.Phase.APPROACH
+
+
+def test_an_interrupt_stops_a_grasp_that_waits_and_no_release(
+    real_time: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    gripper, stops = real_time(), list[str]()
+    for call, expected in ((gripper.release, []), (lambda: gripper.grasp(2.0), ["stop"])):
+        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+            patched.setattr(Future, "exception", interrupt)
+            patched.setattr(gripper._loop, "stop", lambda: stops.append("stop"))
+            call()
+        assert stops == expected
 
 
 @pytest.mark.parametrize("permission", ["library_process", "own_process"])

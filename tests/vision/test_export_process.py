@@ -1,4 +1,4 @@
-"""The export of a checkpoint in a process of its own."""
+"""The export of a checkpoint in a separate process."""
 
 import subprocess
 import sys

@@ -299,7 +299,7 @@ def _fit_and_write(
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")
-    used = [digest_of(path) for path in with_contact or with_reference]
+    used = [sha256_of(path) for path in with_contact or with_reference]
     profile, crushed_at_n = make_profile(name, recorded, fit, ResolvedConfig(config, model), used)
     write_object(out, profile, pack(fit.arrays))
     report = out.with_suffix(".png")
@@ -320,7 +320,7 @@ def _fit_and_write(
     )
 
 
-def digest_of(path: Path) -> str:
+def sha256_of(path: Path) -> str:
     """Returns the SHA-256 of a file."""
     return sha256(path.read_bytes()).hexdigest()
 

@@ -22,9 +22,9 @@ from gripper_calibration.fits.touches import Touches
 from gripper_calibration.plots.taught_plot import draw
 from gripper_calibration.procedures.calibrate_object import (
     default_folder,
-    digest_of,
     make_profile,
     record_touches,
+    sha256_of,
 )
 from gripper_calibration.procedures.teach_candidates import (
     FOLDS,
@@ -177,9 +177,9 @@ def teach(
         paths = find_logs(logs)
     used, without_contact, contact_starts = _sorted_by_contact(paths, model)
     # The same touch in two folds would be both learned and left out.
-    logs_by_digest = {digest_of(path): path for path in used}
+    logs_by_digest = {sha256_of(path): path for path in used}
     # A touch that is replayed would be learned where it is left out.
-    replayed = {} if not replay else {digest_of(path): path for path in find_logs(replay)}
+    replayed = {} if not replay else {sha256_of(path): path for path in find_logs(replay)}
     others = {digest: path for digest, path in replayed.items() if digest not in logs_by_digest}
     in_contact = [path for path in others.values() if _starts_in_contact(path, model.header.preprocess)]
     others = {digest: path for digest, path in others.items() if path not in in_contact}
