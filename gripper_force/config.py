@@ -700,19 +700,36 @@ class Config(Section):
 Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]
 """Assignments ``key.path=value`` with YAML values, or pairs or a mapping of key paths and values."""
 
+Layers = Mapping[str, Overrides]
+"""Overrides by their origin; those of a later one count."""
 
-def load_config(
-    path: str | Path | None = None, overrides: Overrides | None = None, *, new_rig: bool = False
-) -> Config:
+
+def load_config(path: str | Path | None = None, overrides: Overrides | None = None) -> Config:
     """Loads a configuration from defaults, a rig profile, a YAML file and overrides, in that order.
 
     Args:
         path: YAML file; None: defaults.
         overrides: Assignments such as ``["control.rate_hz=100"]``, or ``{"control.rate_hz": 100}``.
-        new_rig: True if ``calibration.rig`` may name a file that does not exist, because it is yet to be written.
 
     Returns:
         The configuration, with each ``auto`` still open: `Gripper.config` has what a run uses.
+
+    Raises:
+        ConfigError: A file, key or value is wrong. The message names it.
+    """
+    return load_with_options(path, overrides, {})
+
+
+def load_with_options(
+    path: str | Path | None, overrides: Overrides | None, options: Layers, *, new_rig: bool = False
+) -> Config:
+    """Loads the configuration of a command, as `load_config`.
+
+    Args:
+        path: YAML file; None: defaults.
+        overrides: Assignments, as of `load_config`.
+        options: Further overrides, which come last, by the name that an error gives to them.
+        new_rig: True if ``calibration.rig`` may name a file that does not exist, because it is yet to be written.
 
     Raises:
         ConfigError: A file, key or value is wrong. The message names it.
@@ -724,9 +741,7 @@ def load_config(
             f"{path} is not a configuration; pass a rig profile with --set calibration.rig={path}, an object "
             f"profile with --profile {path}, or a simulated object with --object {path}"
         )
-    return _with_overrides(
-        lambda given: merged(_rig_settings(given, where, new_rig), given), tree, where, overrides
-    )
+    return _validated(lambda keys, name: _rig_settings(keys, name, new_rig), tree, where, overrides, options)
 
 
 def config_from(tree: Tree, where: str) -> Config:
@@ -746,7 +761,7 @@ def config_from_text(text: str, where: str, overrides: Overrides | None = None) 
     given: Tree = {}
     _assign_all(given, overrides)
     tree = merged(_upgraded(tree_from(text, where)), _rig_settings(given, "--set"))
-    return _with_overrides(lambda tree: tree, tree, where, overrides)
+    return _validated(lambda *_: {}, tree, where, overrides, {})
 
 
 def dump_config(config: Config) -> str:
@@ -775,25 +790,24 @@ def _assign_all(tree: Tree, overrides: Overrides | None) -> None:
         raise ConfigError(f"overrides are a list of assignments, or a mapping, not {overrides!r}") from error
 
 
-def _with_overrides(
-    complete: Callable[[Tree], Tree], tree: Tree, where: str, overrides: Overrides | None
+def _validated(
+    rig: Callable[[Tree, str], Tree], tree: Tree, where: str, overrides: Overrides | None, options: Layers
 ) -> Config:
-    """Validates a tree with overrides. The message blames them only if the tree is valid without them."""
+    """Validates a tree with overrides. The message blames the first of them with which the tree is not valid."""
+    layers = {where: (), "overrides" if isinstance(overrides, Mapping) else "--set": overrides, **options}
     changed = deepcopy(tree)
-    _assign_all(changed, overrides)
     try:
-        return config_from(complete(changed), where)
+        for layer in layers.values():
+            _assign_all(changed, layer)
+        return config_from(merged(rig(changed, where), changed), where)
     except ConfigError:
-        config_from(complete(tree), where)
-        config_from(complete(changed), "overrides" if isinstance(overrides, Mapping) else "--set")
+        for name, layer in layers.items():
+            _assign_all(tree, layer)
+            config_from(merged(rig(tree, name), tree), name)
         raise
 
 
 def _rig_settings(tree: Tree, where: str, new_rig: bool = False) -> Tree:
     """Settings of the rig profile that the tree names; none if it is new and does not exist."""
-    section = tree.get("calibration")
-    if not isinstance(section, dict) or section.get("rig") is None:
-        return {}
-    calibration = validated(Config, {"calibration": section}, where).calibration
-    rig = calibration.rig
+    rig = validated(Config, {k: v for k, v in tree.items() if k == "calibration"}, where).calibration.rig
     return {} if rig is None or (new_rig and not rig.exists()) else read_rig(rig).settings()

@@ -122,6 +122,8 @@ def test_who_is_wrong_is_named_the_file_or_what_is_set(tmp_path: Path) -> None:
         load_config(path, ["sead=3"])
     with pytest.raises(ConfigError, match=r"'sead' \(from --set\)"):
         config_from_text("seed: 4", "run.mcap", ["sead=3"])
+    with pytest.raises(ConfigError, match=r"'calibration\.rig' \(from --set\)"):
+        load_config(path, ["calibration.rig=[1]"])
     path.write_text("sead: 4")
     with pytest.raises(ConfigError, match=r"'sead' \(from .*scene\.yaml\)"):
         load_config(path, ["seed=3"])

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from gripper_force.errors import ConfigError
-
 if TYPE_CHECKING:  # --help needs no configuration
     from gripper_force.config import Config
 
@@ -76,13 +74,12 @@ def load_settings_before_rig(
 def _load(
     path: Path | None, overrides: list[str] | None, options: Mapping[str, object], *, new_rig: bool
 ) -> "Config":
-    from gripper_force.config import load_config
+    from gripper_force.config import load_with_options
 
-    given = [(key, value) for key, value in options.items() if value is not None]
-    try:
-        return load_config(path, [*(overrides or []), *given], new_rig=new_rig)
-    except ConfigError as error:
-        load_config(path, overrides, new_rig=new_rig)  # raises if the command's own options are not to blame
-        wrong = [key for key, _ in given if repr(key) in str(error)] or [key for key, _ in given]
-        names = ", ".join(_NAMES.get(key) or "--" + key.rpartition(".")[2].replace("_", "-") for key in wrong)
-        raise ConfigError(str(error).replace("(from --set)", f"(from {names})")) from None
+    given = {_name(key): {key: value} for key, value in options.items() if value is not None}
+    return load_with_options(path, overrides, given, new_rig=new_rig)
+
+
+def _name(key: str) -> str:
+    """Returns the name of the option that sets a key."""
+    return _NAMES.get(key) or "--" + key.rpartition(".")[2].replace("_", "-")

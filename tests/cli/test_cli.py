@@ -776,6 +776,9 @@ def test_options_win_over_overrides() -> None:
         (["seed=-1"], {"target_n": 3.0}, r"'seed' \(from --set\)"),
         (None, {"control.feedback": "sight"}, r"'control\.feedback' \(from --feedback\)"),
         (None, {"sim.yaw_deg": 91.0}, r"'sim\.yaw_deg' \(from --degrees\)"),
+        (["control=5"], {"control.feedback": "current"}, r"'control' \(from --set\) is a section, got 5"),
+        (None, {"control.timeout_s": 0.1, "seed": 1}, r"'control' \(from --timeout-s\): settle_s 1 must"),
+        (None, {"gripper.open_width_m": 1e-3, "seed": 1}, r"\(from --open-width-m\) is inconsistent"),
     ],
 )
 def test_an_error_names_the_option_that_is_wrong(

@@ -15,7 +15,7 @@ import pytest
 import typer
 
 from gripper_force import cli
-from gripper_force.config import Config, load_config
+from gripper_force.config import Config, load_with_options
 from gripper_force.jobs.grasp import exclusive_device
 from gripper_force.jobs.training.recipe import TrainConfig, recipe, section_from
 from gripper_force.qualification.paper.models import Scale
@@ -126,7 +126,7 @@ def check_keys(call: Call) -> Config | None:
         section_from(Scale, overrides)
     else:
         path = call.values.get("config")
-        return load_config(path if path and path.exists() else None, overrides, new_rig=True)
+        return load_with_options(path if path and path.exists() else None, overrides, {}, new_rig=True)
     return None
 
 
