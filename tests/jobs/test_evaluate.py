@@ -16,9 +16,11 @@ from gripper_force.jobs.evaluate import Evaluation, errors_on, evaluate
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import LoadCellSample
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.checkpoint_writer import save_checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
@@ -59,12 +61,14 @@ def evaluate_clips(checkpoint: Checkpoint, clips: list[Clip]) -> Evaluation:
     return errors_on(clips, forces_n, checkpoint.header.preprocess.lead_in)
 
 
-def test_estimates_equal_the_streaming_estimators(checkpoint: Checkpoint) -> None:
+def test_estimates_equal_the_streaming_estimators(checkpoint: Checkpoint, tmp_path: Path) -> None:
+    path = tmp_path / "written.safetensors"
+    save_checkpoint(path, checkpoint.networks, checkpoint.header)
     clips = [clip("a", "cup", 0), clip("b", "cup", 1), clip("c", "tube", 2)]
     clips[1].valid[10:20] = False
-    result = evaluate_clips(checkpoint, clips)
+    result = evaluate_clips(load_checkpoint(path), clips)
     errors: dict[str, list[float]] = {"cup": [], "tube": []}
-    estimator = ForceEstimator(TorchEngine(checkpoint))
+    estimator = ForceEstimator(TorchEngine(read_model(path)))
     for one in clips:
         estimator.reset()
         for frame, force_n, valid in zip(one.frames, one.forces_n, one.valid, strict=True):

@@ -4,6 +4,7 @@ from dataclasses import replace
 from datetime import date
 from hashlib import sha256
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -17,9 +18,9 @@ from gripper_force.profiles.object_profile import Interval, ObjectProfile, OodLi
 from gripper_force.types import ForceEstimate
 from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint
-from gripper_force.vision.engines.pytorch import TorchEngine
+from gripper_force.vision.engines import pytorch
 from gripper_force.vision.estimator import ForceEstimator, open_estimator
-from gripper_force.vision.header import Header, NetworkConfig, OodModel, Residual
+from gripper_force.vision.header import Header, Model, NetworkConfig, OodModel, Residual
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess, Region, downscale
@@ -40,6 +41,13 @@ def ensemble(*attentions: str, reference: bool = True) -> Checkpoint:
     return Checkpoint(networks, header, digest="")
 
 
+def engine(checkpoint: Checkpoint) -> pytorch.TorchEngine:
+    """An engine of networks that a file would round, or refuse."""
+    model = Model(Path("unwritten.safetensors"), checkpoint.header, checkpoint.digest)
+    with mock.patch.object(pytorch, "load_checkpoint", return_value=checkpoint):
+        return pytorch.TorchEngine(model)
+
+
 @pytest.fixture
 def frames() -> np.ndarray:
     rng = np.random.default_rng(0)
@@ -52,7 +60,7 @@ def run(estimator: ForceEstimator, frames: np.ndarray) -> list[ForceEstimate | N
 
 def test_streaming_equals_batch_inference(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
-    estimates = run(ForceEstimator(TorchEngine(checkpoint), REGION), frames)
+    estimates = run(ForceEstimator(engine(checkpoint), REGION), frames)
     small = np.stack([downscale(frame, REGION, 32) for frame in frames])
     members = predict(checkpoint.networks, checkpoint.header.preprocess, small)  # (2, 30)
     assert estimates[:3] == [None] * 3
@@ -65,7 +73,7 @@ def test_streaming_equals_batch_inference(frames: np.ndarray) -> None:
 
 
 def test_reset_starts_a_new_run(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(TorchEngine(ensemble("ssam")))
+    estimator = ForceEstimator(engine(ensemble("ssam")))
     first = run(estimator, frames)
     assert run(estimator, frames) != first
     estimator.reset()
@@ -74,13 +82,13 @@ def test_reset_starts_a_new_run(frames: np.ndarray) -> None:
 
 
 def test_without_a_reference_every_frame_counts(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(TorchEngine(ensemble("scam", reference=False)))
+    estimator = ForceEstimator(engine(ensemble("scam", reference=False)))
     assert None not in run(estimator, frames)
     assert estimator.reference is None
 
 
 def test_reference_is_mean_of_region(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(TorchEngine(ensemble("ssam")), REGION)
+    estimator = ForceEstimator(engine(ensemble("ssam")), REGION)
     run(estimator, frames)
     expected = np.mean([downscale(frame, REGION, 32) for frame in frames[:4]], axis=0).round()
     assert estimator.reference is not None
@@ -88,7 +96,7 @@ def test_reference_is_mean_of_region(frames: np.ndarray) -> None:
 
 
 def test_attention_map_is_of_newest_frame(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(TorchEngine(ensemble("scam", "ssam")))
+    estimator = ForceEstimator(engine(ensemble("scam", "ssam")))
     assert estimator.attention_map() is None
     run(estimator, frames[:5])
     earlier = estimator.attention_map()
@@ -103,7 +111,7 @@ def test_attention_map_is_of_newest_frame(frames: np.ndarray) -> None:
 
 
 def test_no_attention_map_without_ssam(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(TorchEngine(ensemble("scam", "none")))
+    estimator = ForceEstimator(engine(ensemble("scam", "none")))
     run(estimator, frames[:5])
     assert estimator.attention_map() is None
 
@@ -111,7 +119,7 @@ def test_no_attention_map_without_ssam(frames: np.ndarray) -> None:
 def test_nan_from_a_network_is_refused(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
     checkpoint.force_networks[1].out.bias.fill_(torch.nan)
-    estimator = ForceEstimator(TorchEngine(checkpoint))
+    estimator = ForceEstimator(engine(checkpoint))
     with pytest.raises(NonFiniteError, match="nan"):
         run(estimator, frames)
 
@@ -121,7 +129,7 @@ def test_claimed_error_grows_beyond_validated_forces(frames: np.ndarray, force_n
     checkpoint = ensemble("ssam")
     checkpoint.force_networks[0].out.weight.zero_()
     checkpoint.force_networks[0].out.bias.fill_(force_n / 20)
-    estimate = run(ForceEstimator(TorchEngine(checkpoint)), frames[:4])[3]
+    estimate = run(ForceEstimator(engine(checkpoint)), frames[:4])[3]
     assert estimate is not None
     known_n = {-100.6: 0.0, -100.4: 0.0, -150.0: 0.0, 0.0: 1.0}.get(force_n, 2.0)
     assert estimate.std_n == pytest.approx(known_n + max(abs(force_n) - 100.5, 0), rel=1e-5, abs=1e-4)
@@ -129,15 +137,15 @@ def test_claimed_error_grows_beyond_validated_forces(frames: np.ndarray, force_n
 
 def test_invalid_frame_or_region_is_refused(frames: np.ndarray) -> None:
     with pytest.raises(ConfigError, match="region"):
-        ForceEstimator(TorchEngine(ensemble("ssam")), (0, 0, 100, 100)).update(frames[0])
+        ForceEstimator(engine(ensemble("ssam")), (0, 0, 100, 100)).update(frames[0])
     with pytest.raises(DataError, match="gray"):
-        ForceEstimator(TorchEngine(ensemble("ssam"))).update(frames)
+        ForceEstimator(engine(ensemble("ssam"))).update(frames)
 
 
 @pytest.mark.parametrize("region", [None, REGION])
 def test_a_frame_of_another_size_is_refused_until_a_reset(frames: np.ndarray, region: Region | None) -> None:
     """A region in pixels shows another part of it, and without one the network sees a view that was stretched."""
-    estimator, undisturbed = (ForceEstimator(TorchEngine(ensemble("ssam")), region) for _ in range(2))
+    estimator, undisturbed = (ForceEstimator(engine(ensemble("ssam")), region) for _ in range(2))
     run(estimator, frames[:6])
     for other in (frames[6, :48], np.ascontiguousarray(frames[6].T)):
         with pytest.raises(
@@ -204,7 +212,7 @@ def test_profile_corrects_a_stream_like_a_batch(frames: np.ndarray) -> None:
     small = np.stack([downscale(frame, REGION, 32) for frame in frames])
     forces, read = features(checkpoint.networks, checkpoint.header.preprocess, small)
     profile = correction(1e6, read.mean(0))
-    estimates = run(ForceEstimator(TorchEngine(checkpoint), REGION, profile), frames)
+    estimates = run(ForceEstimator(engine(checkpoint), REGION, profile), frames)
     expected = 0.5 * forces.mean(0) + 0.2 + 2.0 * read[:, 3] + 0.1
     for estimate, force_n in zip(estimates[3:], expected[3:].tolist(), strict=True):
         assert estimate is not None
@@ -230,7 +238,7 @@ def test_limits_of_a_profile_replace_those_of_the_network(
     frames: np.ndarray, network: float, own: float | None, words: str | None
 ) -> None:
     checkpoint = with_score(ensemble("ssam"), network)
-    estimator = ForceEstimator(TorchEngine(checkpoint), REGION, correction(own, np.zeros(7, np.float32)))
+    estimator = ForceEstimator(engine(checkpoint), REGION, correction(own, np.zeros(7, np.float32)))
     if words is None:
         assert run(estimator, frames)[-1] is not None
         return
@@ -239,9 +247,7 @@ def test_limits_of_a_profile_replace_those_of_the_network(
 
 
 def test_a_network_without_a_score_rejects_no_frame(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(
-        TorchEngine(ensemble("ssam")), REGION, correction(1e-6, np.zeros(7, np.float32))
-    )
+    estimator = ForceEstimator(engine(ensemble("ssam")), REGION, correction(1e-6, np.zeros(7, np.float32)))
     assert run(estimator, frames)[-1] is not None
 
 

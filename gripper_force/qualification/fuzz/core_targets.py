@@ -62,10 +62,10 @@ from gripper_force.types import (
     ServoState,
     VisualForce,
 )
-from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import FORMAT, Header, NetworkConfig, Residual
+from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.ood import orthonormal, residual_share
 from gripper_force.vision.preprocess import Preprocess
@@ -402,7 +402,7 @@ def _use_header(data: bytes, path: Path) -> None:
 
 def _use_checkpoint(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    estimator = ForceEstimator(TorchEngine(load_checkpoint(path)))
+    estimator = ForceEstimator(TorchEngine(read_model(path)))
     rng = np.random.default_rng(0)
     for _ in range(5):
         estimator.update(rng.integers(0, 256, (_SIDE, _SIDE), np.uint8))

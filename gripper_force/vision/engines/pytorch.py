@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, StepOutput
 from gripper_force.vision.ensemble_step import ATTENTION, EnsembleStep
 from gripper_force.vision.header import Model, check_not_exported
@@ -15,10 +15,8 @@ from gripper_force.vision.header import Model, check_not_exported
 class TorchEngine(Engine):
     """Runs the networks of a checkpoint in float32."""
 
-    def __init__(
-        self, model: Model | Checkpoint, precision: Precision = "float32", threads: int | None = None
-    ) -> None:
-        """Takes a checkpoint, or loads one.
+    def __init__(self, model: Model, precision: Precision = "float32", threads: int | None = None) -> None:
+        """Loads a checkpoint.
 
         Args:
             model: The checkpoint.
@@ -31,11 +29,10 @@ class TorchEngine(Engine):
         """
         if threads is not None:
             torch.set_num_threads(threads)
-        if isinstance(model, Model):
-            check_not_exported(model)
-            model = load_checkpoint(model.path)
-        super().__init__(model.header)
-        self._step = EnsembleStep(model.networks).eval()
+        check_not_exported(model)
+        checkpoint = load_checkpoint(model.path)
+        super().__init__(checkpoint.header)
+        self._step = EnsembleStep(checkpoint.networks).eval()
         self._has_attention = ATTENTION in self._step.outputs
 
     def _zero_states(self) -> None:
