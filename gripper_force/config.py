@@ -19,6 +19,7 @@ from gripper_force.schema import (
     as_path,
     assign,
     assign_value,
+    check_keys,
     dump,
     merged,
     read_tree,
@@ -471,12 +472,10 @@ class ControlConfig(Section):
     @property
     def plant(self) -> tuple[float, float, float]:
         """Gain, lag in s and delay in s of the force loop's plant; the defaults where nothing is known."""
-        given = (self.plant_gain, self.plant_lag_ms, self.plant_delay_ms)
         default_delay_ms = _DEFAULT_LATENCY_MS + 0.5e3 / self.frame_hz
-        defaults = (*_DEFAULT_PLANT, default_delay_ms)
-        gain, lag_ms, delay_ms = (
-            default if value is None else value for value, default in zip(given, defaults, strict=True)
-        )
+        gain = _DEFAULT_PLANT[0] if self.plant_gain is None else self.plant_gain
+        lag_ms = _DEFAULT_PLANT[1] if self.plant_lag_ms is None else self.plant_lag_ms
+        delay_ms = default_delay_ms if self.plant_delay_ms is None else self.plant_delay_ms
         if self.feedback == "vision":
             # A press does not excite the oscillation of the jaws on the object's spring, and feedback from
             # vision alone would amplify it. So the loop is never tuned faster than for the default plant.
@@ -679,7 +678,12 @@ class Config(Section):
         return self.camera.backend != "none" and self.vision.checkpoint != "none"
 
     def with_values(self, **values: Any) -> Self:
-        """Returns a copy with other values, not yet validated. A dict changes only the keys of that section."""
+        """Returns a copy with other values, not yet validated. A dict changes only the keys of that section.
+
+        Raises:
+            ConfigError: A key is unknown.
+        """
+        check_keys(Config, values, "with_values")
         parts = {k: getattr(self, k).model_copy(update=v) for k, v in values.items() if isinstance(v, dict)}
         return self.model_copy(update=values | parts)
 

@@ -152,6 +152,15 @@ def validated(section: type[S], tree: Tree, where: str, what: str = "configurati
         raise ConfigError(_sentence(section, error, where, what)) from error
 
 
+def check_keys(section: type[Section], tree: Tree, where: str) -> None:
+    """Raises `ConfigError` for an unknown key in a tree. Other errors, such as wrong values, are left."""
+    try:
+        section.model_validate(tree)
+    except ValidationError as error:
+        if any(one["type"] == "extra_forbidden" for one in error.errors()):
+            raise ConfigError(_sentence(section, error, where, "configuration")) from error
+
+
 def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
     """Reads a YAML file that states its format under the key ``format``.
 

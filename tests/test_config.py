@@ -10,6 +10,7 @@ from gripper_force.config import (
     Config,
     LogConfig,
     SimConfig,
+    VisionConfig,
     config_from,
     config_from_text,
     dump_config,
@@ -211,6 +212,30 @@ def test_a_file_that_is_no_configuration_is_named(tmp_path: Path, data: bytes | 
 def test_wrong_overrides_are_named(overrides: Any, sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
         load_config(None, overrides)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        (
+            {"contrl": 3},
+            "unknown configuration key 'contrl' .*did you mean 'control'.*; known here: object, ",
+        ),
+        ({"contrl": {"rate_hz": 3}, "seed": "x"}, "'contrl' .*did you mean 'control'"),
+        (
+            {"control": {"rat_hz": 3}},
+            r"'control\.rat_hz' \(from with_values\); did you mean 'control\.rate_hz'",
+        ),
+    ],
+)
+def test_a_copy_with_an_unknown_key_is_refused(values: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        Config().with_values(**values)
+
+
+def test_the_values_of_a_copy_are_not_yet_validated() -> None:
+    config = Config().with_values(seed=-1, vision=VisionConfig(threads=2), control={"rate_hz": -3.0})
+    assert (config.seed, config.vision.threads, config.control.rate_hz) == (-1, 2, -3.0)
 
 
 def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:

@@ -55,12 +55,9 @@ def read_profiles(config: Config) -> Profiles:
     """Reads the profiles that the configuration names. Raises `ConfigError` that names the file."""
     rig_path = config.calibration.rig
     object_path = None if config.profile is None else find_object(config.profile)
-    return Profiles(
-        rig=None if rig_path is None else read_rig(rig_path),
-        rig_path=rig_path,
-        object=None if object_path is None else read_object(object_path),
-        object_path=object_path,
-    )
+    rig = None if rig_path is None else read_rig(rig_path)
+    profile = None if object_path is None else read_object(object_path)
+    return Profiles(rig, rig_path, profile, object_path)
 
 
 def with_bundle(config: Config) -> tuple[Config, str]:

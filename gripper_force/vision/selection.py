@@ -123,9 +123,8 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Engin
             model, engine, precision, threads = setting
             keeps_threads = engine == "torch" and not set_threads
             with _restored_threads(engine):
-                p50_ms, p99_ms = step_times_ms(
-                    open_engine(model, engine, precision, None if keeps_threads else threads)
-                )
+                opened = open_engine(model, engine, precision, None if keeps_threads else threads)
+                p50_ms, p99_ms = step_times_ms(opened)
             known[key] = EngineCandidate(_name(model), engine, precision, threads, p50_ms, p99_ms, error_n)
             if engine_version(engine):  # without a version, a measurement could outlive an update
                 update_cache({key: known[key]})
