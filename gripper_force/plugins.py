@@ -18,7 +18,7 @@ _METHODS: Final = {
     "load_cells": ("drain", "start", "counts", "close"),
     "engines": ("step", "warm_up"),
 }
-"""Methods of each interface, which a class is checked for before one is called."""
+"""Methods of each interface, which a class, or what a function makes, is checked for before one is called."""
 
 _RETURNS: Final = {"read": "ServoState", "newest": "Frame NoneType", "drain": "list tuple", "counts": "dict"}
 """Names of the types that methods may return; names, because importing the types takes time. A wrong type is reported
@@ -99,23 +99,26 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
         ) from error
     if not callable(found):
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
-    missing = [method for method in _METHODS.get(group, ()) if not hasattr(found, method)]
-    if isinstance(found, type) and missing:
+    if isinstance(found, type) or group == "servos":  # a servo's class is asked for its `spec` first
+        _check_methods(found, group, f"{key}={name}: {target}")
+    return found if name in builtin else _Plugin(found, group, f"{key}={name}: {attribute}")
+
+
+def _check_methods(part: Any, group: str, name: str) -> None:
+    if missing := [method for method in _METHODS.get(group, ()) if not hasattr(part, method)]:
         interface = "vision.engines.Engine" if group == "engines" else "interfaces"
         raise ConfigError(
-            f"{key}={name}: {target} has no method {missing[0]!r}; name a class with the methods that "
-            f"gripper_force.{interface} describes"
+            f"{name} has no method {missing[0]!r}; name a class with the methods that gripper_force.{interface} "
+            "describes"
         )
-    if name in builtin:
-        return found
-    return _Plugin(found, f"{key}={name}: {attribute}", ConfigError if group == "engines" else DeviceError)
 
 
 class _Plugin:
     """A third-party class, or an object that it made: an error of its code names it, its method and the error."""
 
-    def __init__(self, part: Any, name: str, error_type: type[GripperError]) -> None:
-        self._part, self._name, self._error_type = part, name, error_type
+    def __init__(self, part: Any, group: str, name: str) -> None:
+        self._part, self._group, self._name = part, group, name
+        self._error_type: type[GripperError] = ConfigError if group == "engines" else DeviceError
 
     def __getattr__(self, name: str) -> Any:
         # Not self._part: copy and pickle ask an object that has none yet.
@@ -124,7 +127,8 @@ class _Plugin:
 
     def __call__(self, *arguments: Any) -> Any:
         made = self._call(self._part, self._name, *arguments)
-        return _Plugin(made, self._name, self._error_type)
+        _check_methods(made, self._group, f"{self._name}()")
+        return _Plugin(made, self._group, self._name)
 
     def _call(self, function: Callable[..., Any], called: str, *arguments: Any, **named: Any) -> Any:
         try:

@@ -100,6 +100,23 @@ def test_a_class_without_one_of_the_methods_is_refused(monkeypatch: pytest.Monke
         load_class("cameras", {}, "fractions:Half", "camera.backend")
 
 
+def test_what_a_function_makes_is_checked_as_a_class_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_maker.py").write_text(
+        "class Engine:\n    def step(self, frame): ...\n\ndef make(*arguments):\n    return Engine()\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, found in (("Engine", "own_maker:Engine"), ("make", "make()")):
+        sentence = (
+            f"x.engine=own_maker:{name}: {found} has no method 'warm_up'; name a class with the methods "
+        )
+        with pytest.raises(ConfigError, match=re.escape(sentence)):
+            load_class("engines", {}, f"own_maker:{name}", "x.engine")("model")
+    with pytest.raises(ConfigError, match=r"own_maker:make has no method 'spec'"):
+        load_class("servos", {}, "own_maker:make", "servo.backend")
+
+
 def test_a_missing_system_library_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_vendor.py").write_text("import ctypes\n\nctypes.CDLL('libvendor_is_missing.so')\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -54,13 +54,12 @@ class OpenVinoEngine(Engine):
         self._states = [[openvino.Tensor(s.element_type, s.shape) for s in states] for _ in range(2)]
         self._requests = [compiled.create_infer_request() for _ in range(2)]
         self._first_state = len(compiled.outputs) - len(states)
+        next_states = compiled.outputs[self._first_state :]
         for turn, request in enumerate(self._requests):
             request.set_tensor(frame, self._frame)
             for port, tensor in zip(states, self._states[turn], strict=True):
                 request.set_tensor(port, tensor)
-            for port, tensor in zip(
-                compiled.outputs[self._first_state :], self._states[1 - turn], strict=True
-            ):
+            for port, tensor in zip(next_states, self._states[1 - turn], strict=True):
                 request.set_tensor(port, tensor)
         self._turn = 0
 
