@@ -271,7 +271,7 @@ def object_(
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     given, name = name, settings.object  # a path has become a name
     folder = folder or job.default_folder(name)
-    job.check_before_touches(settings, name, out)
+    prepared = job.prepare(settings, name, out)
     if logs is None:
         _tell_existing(settings, touches, folder, fresh)
         logs = _touches(settings, touches, peak_n, folder, pause=pause, may_stop=True)
@@ -279,7 +279,7 @@ def object_(
         logs = find_logs(logs)
         _tell_other_objects(name, logs)
     with console.bar("calibrating", len(logs) + 2) as progress:
-        result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
+        result = job.fit_and_write(prepared, logs, progress)
     _tell_left_out(result)
     if result.mae_after_n is None:
         console.err.print(

@@ -109,6 +109,25 @@ class ObjectCalibration:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """Network, engine and place of a calibration, open and checked before its touches.
+
+    Attributes:
+        config: The configuration without ``auto``.
+        model: The network to correct.
+        engine: Its engine.
+        name: Name of the object.
+        out: Profile to write.
+    """
+
+    config: Config
+    model: Model
+    engine: Engine
+    name: str
+    out: Path
+
+
 def calibrate_object(
     config: Config,
     name: str,
@@ -158,7 +177,7 @@ def calibrate_object(
             result = gripper_force.calibrate_object(config, "mug", touches=8)
             print(result.profile_path, result.mae_before_n, result.mae_after_n)
     """
-    out = check_before_touches(config, name, out)
+    prepared = prepare(config, name, out)
     if logs is None:
         named = config.with_values(object=name)
         paths = []
@@ -170,11 +189,11 @@ def calibrate_object(
         paths = find_logs(logs)
     if not paths:
         raise DataError(f"there is no log to calibrate {name!r} from; record touches of it first")
-    return _fit_and_write(config, name, paths, out, progress)
+    return fit_and_write(prepared, paths, progress)
 
 
-def check_before_touches(config: Config, name: str, out: str | Path | None = None) -> Path:
-    """Checks what a calibration needs before the first touch. Returns the path of the profile.
+def prepare(config: Config, name: str, out: str | Path | None = None) -> Prepared:
+    """Opens and checks what a calibration needs, before the first touch. The arguments are `calibrate_object`'s.
 
     Raises:
         ConfigError: There is no network to correct, its engine can't run it, the name can't be part of a file name, or
@@ -184,8 +203,14 @@ def check_before_touches(config: Config, name: str, out: str | Path | None = Non
     check_name(name)
     path = user_folder() / f"{name}.yaml" if out is None else Path(out)
     check_object_place(path)
-    _open_network(config)
-    return path
+    config, model, _ = resolve_vision(config)
+    if model is None:
+        raise ConfigError(
+            "calibrate object corrects a network, but vision.checkpoint is none; name a network, such as default"
+        )
+    set_threads = allowed_options().torch_threads
+    engine = open_configured_engine(model, config.vision, set_threads=set_threads)
+    return Prepared(config, model, engine, name, path)
 
 
 def record_touches(
@@ -266,22 +291,10 @@ def _plan(touches: int, peak_n: float | None) -> RecordingPlan:
     return RecordingPlan(touches, touches=1, peak_n=peak_n, test_every=None)
 
 
-def _open_network(config: Config) -> tuple[Config, Model, Engine]:
-    """Returns the configuration without ``auto``, the network to correct, and its engine."""
-    config, model, _ = resolve_vision(config)
-    if model is None:
-        raise ConfigError(
-            "calibrate object corrects a network, but vision.checkpoint is none; name a network, such as default"
-        )
-    set_threads = allowed_options().torch_threads
-    return config, model, open_configured_engine(model, config.vision, set_threads=set_threads)
-
-
-def _fit_and_write(
-    config: Config, name: str, paths: Sequence[Path], out: Path, progress: Progress
-) -> ObjectCalibration:
-    config, model, engine = _open_network(config)
-    run = partial(features, engine)
+def fit_and_write(prepared: Prepared, paths: Sequence[Path], progress: Progress) -> ObjectCalibration:
+    """Makes the profile and the figure from the logs of the touches, as `calibrate_object`."""
+    model, out = prepared.model, prepared.out
+    run = partial(features, prepared.engine)
     recordings = {}
     for path in sorted(paths, key=started_ns):  # the order shows after which touch the object stayed narrower
         recordings[path] = read_log(path, model.header.preprocess, run)
@@ -300,7 +313,9 @@ def _fit_and_write(
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")
     used = [sha256_of(path) for path in with_contact or with_reference]
-    profile, crushed_at_n = make_profile(name, recorded, fit, ResolvedConfig(config, model), used)
+    profile, crushed_at_n = make_profile(
+        prepared.name, recorded, fit, ResolvedConfig(prepared.config, model), used
+    )
     write_object(out, profile, pack(fit.arrays))
     report = out.with_suffix(".png")
     draw(profile, fit, touches, curve, report)

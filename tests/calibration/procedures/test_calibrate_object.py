@@ -10,6 +10,7 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from gripper_force.runtime.resolve import resolve
 from gripper_force.types import NS_PER_S, Event, Frame, GraspStatus, LoadCellSample, Phase, ServoState
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.estimator import ForceEstimator
+from gripper_force.vision.estimator import ForceEstimator, open_configured_engine
 
 QUICK = [
     "object=stapler",
@@ -107,7 +108,11 @@ def test_missing_touches_are_recorded_and_then_fitted(touched: list[Path], tmp_p
     assert sum(steps) == 2 + 2 + 2
 
 
-def test_command_calibrates_from_one_touch(touched: list[Path], tmp_path: Path) -> None:
+def test_command_calibrates_from_one_touch_and_opens_the_engine_once(
+    touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = Mock(wraps=open_configured_engine)
+    monkeypatch.setattr(job, "open_configured_engine", opened)
     shutil.copy(touched[0], tmp_path)
     keys = [part for key in QUICK[1:] for part in ("--set", key)]
     given = ["calibrate", "object", "stapler", "--touches", "1", "--peak-n", "6", "--json", *keys]
@@ -115,6 +120,7 @@ def test_command_calibrates_from_one_touch(touched: list[Path], tmp_path: Path) 
         app, [*given, "--folder", str(tmp_path), "--out", str(tmp_path / "it.yaml")], catch_exceptions=False
     )
     assert result.exit_code == 0, result.stderr
+    assert opened.call_count == 1
     found = json.loads(result.stdout)
     assert (found["touches"], found["after_n"], found["touches_needed"]) == (1, None, [])
     assert Path(found["report"]).stat().st_size > 10_000
@@ -144,7 +150,7 @@ def test_the_threads_of_pytorch_are_the_programs() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(before + 1)
     try:
-        job.check_before_touches(load_config(None, [*QUICK, "vision.engine=torch"]), "stapler")
+        job.prepare(load_config(None, [*QUICK, "vision.engine=torch"]), "stapler")
         assert torch.get_num_threads() == before + 1
     finally:
         torch.set_num_threads(before)
