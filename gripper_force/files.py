@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Final
 
 from gripper_force.errors import DataError
@@ -27,6 +28,13 @@ def unfinished(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
         yield part
         part.replace(path)
+
+
+def make_place(path: Path) -> None:
+    """Creates the folder of a file. Raises `OSError` if the file can't be written there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent):
+        pass  # its name is no one else's, such as the unfinished file's of a writer
 
 
 @contextmanager

@@ -3,12 +3,15 @@
 import fcntl
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from gripper_force.errors import DataError
 from gripper_force.files import unfinished
+from gripper_force.jobs.profile_files import check_place
+from gripper_force.vision import checkpoint_writer
 
 KILLED = """
 import os, signal, sys
@@ -53,6 +56,19 @@ def test_a_second_writer_is_refused_and_harms_nothing(tmp_path: Path) -> None:
         with unfinished(tmp_path / "b.mcap") as other:  # another file of the folder is free
             other.write_text("other")
     assert (names(tmp_path), path.read_text()) == (["a.mcap", "b.mcap"], "first")
+
+
+@pytest.mark.parametrize("check", [check_place, checkpoint_writer.check_place])
+def test_a_check_of_the_place_leaves_the_file_of_a_running_writer(
+    tmp_path: Path, check: Callable[[Path], None]
+) -> None:
+    path = tmp_path / "a.safetensors"
+    with unfinished(path) as part:
+        part.write_text("first")
+        before = names(tmp_path)
+        check(path)
+        assert names(tmp_path) == before
+    assert path.read_text() == "first"
 
 
 def test_a_killed_writer_locks_nothing(tmp_path: Path) -> None:

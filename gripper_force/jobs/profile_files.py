@@ -7,7 +7,7 @@ import numpy as np
 from safetensors.numpy import save
 
 from gripper_force.errors import ConfigError
-from gripper_force.files import unfinished
+from gripper_force.files import make_place, unfinished
 from gripper_force.profiles.correction import ProfileArrays
 from gripper_force.profiles.object_profile import ObjectProfile, weights_path
 from gripper_force.profiles.rig_profile import (
@@ -30,11 +30,8 @@ def check_place(path: Path) -> None:
     """Creates the folder of a file. Raises `ConfigError` if the file can't be written there."""
     if path.is_dir():
         raise ConfigError(f"can't write {path}: it is a folder; name a file in it")
-    probe = path.with_name(f".{path.name}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        make_place(path)
     except OSError as error:
         raise ConfigError(
             f"can't write {path}: {error.strerror}, {error.filename}; name another file"

@@ -7,7 +7,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
-from gripper_force.files import unfinished
+from gripper_force.files import make_place, unfinished
 from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.header import FORMAT, Header, digest_of, read_checkpoint
 
@@ -39,11 +39,8 @@ def check_place(path: Path) -> None:
         raise CheckpointError(f"can't write the checkpoint {path}: it is a folder; name a file")
     if path.suffix != ".safetensors":  # of an exported network, or of the figure that is drawn beside
         raise CheckpointError(f"can't write a checkpoint to {path}; name a file that ends in .safetensors")
-    probe = path.with_name(f".{path.name}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink(missing_ok=True)  # several processes may check at the same time
+        make_place(path)
     except OSError as error:
         raise CheckpointError(
             f"can't write the checkpoint {path}: {error.strerror}; name another file"
