@@ -180,6 +180,11 @@ class ControlLoop:
             if not self._error_was_raised:
                 self._raise_error()
 
+    def lose(self, _owner: object) -> None:
+        """Gives the signals back once the program has lost its object; the control thread ends the run by itself."""
+        if self._background:  # otherwise these resources are those of the run, too
+            self._resources.close()
+
     def _own_cycle(self) -> contextlib.ExitStack:
         """Lets only this thread run the control cycle: a second one would use the servo's port at the same time."""
         if not self._cycle_lock.acquire(blocking=False):

@@ -110,7 +110,7 @@ class Gripper:
     """
 
     def __init__(self, loop: ControlLoop, log: Path | None) -> None:
-        self._loop, loop.owner = loop, weakref.ref(self)
+        self._loop, loop.owner = loop, weakref.ref(self, loop.lose)
         self._resolved = loop.session.resolved
         self.config, self.log = self._resolved.config, log
 

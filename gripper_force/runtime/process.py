@@ -161,10 +161,10 @@ def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
         return
     if not _interrupts:
         _received.clear()
+    _interrupts.append(interrupt)  # first: the end of another gripper would restore the handlers
     for number in SIGNALS:
         if signal.getsignal(number) not in (_handle_signal, signal.SIG_IGN):
             _earlier_handlers[number] = signal.signal(number, _handle_signal)
-    _interrupts.append(interrupt)
     try:
         yield
     finally:

@@ -119,13 +119,8 @@ class StateTracker:
             load_cell_n=None if cell is None else cell.force_n,
         )
         share = self._vision_cycles / self._hold_cycles if self._hold_cycles else 0.0
+        gain = estimate.object_gain or None
+        gain_std = estimate.object_gain_std if gain else None
         return state, GraspResult(
-            state.outcome,
-            state.force_n,
-            state.std_n,
-            state.width_m,
-            share,
-            state.reason,
-            estimate.object_gain or None,
-            estimate.object_gain_std if estimate.object_gain else None,
+            state.outcome, state.force_n, state.std_n, state.width_m, share, state.reason, gain, gain_std
         )

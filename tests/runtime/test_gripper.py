@@ -1045,14 +1045,18 @@ def test_ctrl_c_in_a_call_that_waits_stops_jaws_that_close(
     gripper.release()
 
 
+@pytest.mark.usefixtures("own_process")
 def test_a_gripper_that_is_lost_is_closed(
     quick: list[str], server: PtyServer, opening: list[ControlLoop]
 ) -> None:
+    before = signal.getsignal(signal.SIGINT)
     sets = [*quick, "clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
     sets += ["servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=500"]
     gripper = gf.open_gripper(overrides=sets)
     assert torque(server) == 1
+    assert signal.getsignal(signal.SIGINT) != before
     del gripper
+    assert (process._interrupts, signal.getsignal(signal.SIGINT)) == ([], before)
     assert opening[0]._ended.wait(60)
     assert torque(server) == 0
     with gf.open_gripper(overrides=sets) as again:  # the port is free
