@@ -308,7 +308,7 @@ def fit_and_write(prepared: Prepared, paths: Sequence[Path], progress: Progress)
     with_contact = {path: one for path, one in with_reference.items() if one.has_contact}
     recorded = join(with_contact or with_reference)  # without any contact, the fit reports the largest force
     touches = recorded.touches
-    fit = fit_correction(touches, COVERAGE, model.header.ood)
+    fit = fit_correction(touches, COVERAGE, prepared.engine.header.ood)  # bfloat16 has no score to limit
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")

@@ -132,6 +132,15 @@ def test_command_calibrates_from_one_touch_and_opens_the_engine_once(
     assert f"next: gripper-force {words}" in result.stderr
 
 
+def test_in_bfloat16_a_profile_has_no_limits_as_its_runs_have_no_score(
+    touched: list[Path], tmp_path: Path
+) -> None:
+    pytest.importorskip("openvino")
+    config = load_config(None, [*QUICK, "vision.engine=openvino", "vision.precision=bfloat16"])
+    result = calibrate_object(config, "stapler", logs=touched[:1], out=tmp_path / "it.yaml")
+    assert result.profile.ood_limits is None
+
+
 def test_calibration_needs_no_pytorch() -> None:
     code = "import sys, gripper_calibration.procedures.calibrate_object; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
