@@ -27,6 +27,8 @@ if TYPE_CHECKING:  # --help loads no NumPy
 
 err = Console(stderr=True, highlight=False)
 out = Console(highlight=False)
+if not out.is_terminal:
+    out.width = 1000  # a file or a pipe has no width: a path must not be broken
 
 _SPEED_S: Final = 3600.0
 """Time over which the speed of a job is averaged: a step of a training or of a matrix may take minutes."""

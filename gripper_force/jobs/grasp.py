@@ -57,6 +57,7 @@ class GraspSummary(_Score):
 
     Attributes:
         result: Outcome of the grasp, or ``interrupted``.
+        reason: Its reason; empty if interrupted.
         object: Name of the object.
         target_n: Target force.
         seed: Seed of the run.
@@ -64,7 +65,7 @@ class GraspSummary(_Score):
         vision_share: Share of the hold's cycles that used vision, 0 to 1; None without a hold or without vision.
         vision_losses: Reasons why it was not used in the hold, and their durations, the longest first.
         object_gain: Gain of the object by motor current (see `gripper_force.control.object_gain`); None if it is not
-            known.
+            known, or the grasp was not held.
         object_gain_std: Its relative standard deviation.
         object_gain_true: Stiffness of the simulated object over that of its kind; None for a real one.
         fell_back: True if the feedback includes vision, but less than half of the hold used it.
@@ -86,6 +87,7 @@ class GraspSummary(_Score):
     """
 
     result: str
+    reason: str
     object: str
     target_n: float
     seed: int
@@ -226,10 +228,13 @@ def summarise_grasp(path: Path) -> GraspSummary:
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
     # A release that fails does not change what the grasp reached.
     outcomes = [s.outcome for s in statuses if s.outcome not in (Outcome.NONE, Outcome.BLOCKED)]
-    gains = [fused for fused in records[FusedForce] if fused.object_gain]
+    result = outcomes[-1] if outcomes else "interrupted"
+    # A grasp that was not held teaches no gain.
+    gains = [fused for fused in records[FusedForce] if fused.object_gain and result == Outcome.HELD]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
     return {
-        "result": outcomes[-1] if outcomes else "interrupted",
+        "result": result,
+        "reason": next((s.reason for s in statuses if s.outcome == result), ""),
         "object": config.object,
         "target_n": config.target_n,
         "seed": config.seed,

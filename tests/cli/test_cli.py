@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -22,10 +22,14 @@ from gripper_calibration.procedures.servo_measurement import measure
 from gripper_force import cli
 from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
+from gripper_force.cli.output.calibrate import rig_table
+from gripper_force.cli.output.runs import grasp_table, trials_table
 from gripper_force.config import load_config
 from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import cpu
+from gripper_force.jobs.grasp import GraspSummary, summarise_grasp
+from gripper_force.jobs.trials import TrialsSummary
 from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
 from gripper_hw.dynamixel.control_table import load_model
@@ -393,7 +397,7 @@ def test_sets_are_recorded_judged_and_kept(run: Run, sets: list[str]) -> None:
     assert set(result["overall"]) >= keys
     again = run(*asked, *sets, *eyes)
     assert again.code == 0
-    for text in ("stapler-350lux-01", "Hz of 20", "lag ms", "0-1"):
+    for text in ("stapler-350lux-01", "Hz of 20", "lag ms", "0 to 1"):
         assert text in again.out
     assert Path(one["log"]).stat().st_mtime_ns == made_ns
     replayed = run("replay", one["log"], "--json").json()
@@ -868,6 +872,40 @@ def test_a_number_beyond_its_range_is_refused(run: Run) -> None:
 def test_paths_with_brackets_are_shown_whole(capsys: pytest.CaptureFixture[str]) -> None:
     cli.console.pairs({"log": Path("data/[old]/a[/x].mcap")})
     assert "data/[old]/a[/x].mcap" in capsys.readouterr().out
+
+
+def test_a_long_path_in_a_pipe_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    path = "/a/home/folder" * 20
+    cli.console.pairs({"profile": path})
+    assert path in capsys.readouterr().out
+
+
+def test_a_table_of_trials_fits_80_columns_without_a_broken_word(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trial = dict.fromkeys((*GRASP_KEYS, "vision_share", "object_gain", "feedback"))
+    trial |= {"object": "paper_cup", "target_n": 6.45, "result": "timeout", "fell_back": True}
+    summary = {"fell_back": 0, "peak_n": None, "estimate_mae_n": {}}
+    monkeypatch.setattr(console.out, "width", 80)
+    trials_table([cast(GraspSummary, trial)], cast(TrialsSummary, summary))
+    said = capsys.readouterr().out
+    assert {"paper_cup", "load cell", "overshoot", "timeout,"} <= set(re.split(r"\s{2,}|\n", said))
+
+
+def test_a_setting_that_a_camera_lacks_is_not_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    rig_table({"image": {"sensor": None, "fourcc": "MJPG"}, "other": {"sensor": None}})
+    shown = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert shown == [["image", "fourcc", "MJPG"], ["other", "-"]]
+
+
+@pytest.mark.parametrize(("result", "told"), [("timeout", True), ("held", False)])
+def test_a_grasp_that_was_not_held_says_why(
+    fused_log: Path, capsys: pytest.CaptureFixture[str], result: str, told: bool
+) -> None:
+    summary = summarise_grasp(fused_log)
+    summary["result"], summary["reason"] = result, "not held within 8 s: the camera sees 0.0 N"
+    grasp_table(summary)
+    assert (summary["reason"] in capsys.readouterr().out) == told
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,11 @@ import pytest
 from gripper_force.config import config_from_text, load_config
 from gripper_force.jobs import grasp as grasp_module
 from gripper_force.jobs.grasp import GraspSummary, exclusive_device, summarise_grasp
+from gripper_force.jobs.report.reading import read_run
 from gripper_force.jobs.trials import summarise_trials
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
-from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, VisualForce
+from gripper_force.types import NS_PER_S, FusedForce, GraspStatus, LoadCellSample, VisualForce
 
 
 def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
@@ -21,6 +22,7 @@ def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
     assert summary["log"] == str(fused_log)
     assert (summary["object"], summary["target_n"], summary["seed"]) == ("stapler", 3.0, 0)
     assert summary["result"] in {"held", "timeout"}
+    assert summary["reason"] == next(s.reason for s in log.records(GraspStatus) if s.outcome)
     assert summary["loop_hz"] == pytest.approx(200.0)
     assert summary["peak_n"] == max(s.force_n for s in log.records(LoadCellSample))
     assert summary["load_cell_mean_n"] is not None
@@ -64,6 +66,23 @@ def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:
     ):
         assert summary[name] is None
     assert summary["loop_hz"] == pytest.approx(200.0)
+
+
+@pytest.mark.parametrize(("outcome", "gain"), [("held", 3.0), ("timeout", None)])
+def test_a_grasp_that_was_not_held_states_no_gain_of_the_object(
+    fused_log: Path, tmp_path: Path, outcome: str, gain: float | None
+) -> None:
+    reader = LogReader(fused_log)
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config=reader.config, metadata=reader.metadata) as writer:
+        for record in reader.records():
+            if isinstance(record, FusedForce):
+                record = replace(record, object_gain=3.0, object_gain_std=0.2)
+            elif isinstance(record, GraspStatus) and record.outcome:
+                record = replace(record, outcome=outcome)
+            writer.write(record)
+    assert summarise_grasp(path)["object_gain"] == gain
+    assert read_run(LogReader(path)).object_gain == (gain and (gain, 0.2))
 
 
 def test_the_error_floor_is_that_of_valid_samples(fused_log: Path, tmp_path: Path) -> None:

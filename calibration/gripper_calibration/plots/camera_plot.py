@@ -60,7 +60,7 @@ def draw(
         for number, corners in markers.items():
             left.add_patch(Polygon(corners, fill=False, color=OTHER, lw=1.2))
             left_px, top_px = corners.min(axis=0)
-            left.text(left_px, top_px - 2, f"marker {number}", color=FIT, va="bottom")
+            left.text(left_px, top_px - 2, f"{number}", color=FIT, va="bottom")
         _plot_lags(right, calibration, touches)
 
 
@@ -90,7 +90,7 @@ def _plot_lags(axes: Axes, calibration: CameraCalibration, touches: Sequence[Cam
     shown = np.array([lag.low, lag.high, *(t.correlation_ms for t in touches), *(t.lag_ms for t in used)])
     shown = shown[np.isfinite(shown)]
     axes.set_ylim(shown.min() - 3, shown.max() + 12)
-    axes.legend(loc="upper left", ncols=2)
+    axes.legend(loc="upper left")
     label_axes(axes, "lag of the camera's timestamps", "force of the touch, N", "lag, ms")
 
 

@@ -13,5 +13,5 @@ GRAY: Final = "#8a9099"
 def value_text(value: CalibratedValue, unit: str) -> str:
     """Returns a value with its unit and interval, for a person."""
     if value.low is None or value.high is None:
-        return f"{value.value:.5g} {unit} (given)"
-    return f"{value.value:.5g} {unit} ({value.low:.5g} to {value.high:.5g})"
+        return f"{value.value:.4g} {unit} (given)"
+    return f"{value.value:.4g} {unit} ({value.low:.4g} to {value.high:.4g})"

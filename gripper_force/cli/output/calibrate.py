@@ -53,7 +53,8 @@ def _found(value: object) -> object:
     if not isinstance(value, dict):
         return value
     if "low" not in value:  # settings
-        return ", ".join(f"{name} {setting}" for name, setting in value.items())
+        known = {name: setting for name, setting in value.items() if setting is not None}
+        return ", ".join(f"{name} {setting}" for name, setting in known.items()) or None
     if value["low"] is None:
         return f"{value['value']:.6g} (given)"
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"

@@ -34,7 +34,7 @@ def sets_table(r: "RecordingSummary") -> None:
     out.print(table)
     table = Table("force N", "frames", box=None)
     for n, count in r.overall.histogram.items():
-        table.add_row(f"{n}-{n + 1}", str(count))
+        table.add_row(f"{n} to {n + 1}", str(count))
     out.print(table)
     for warning in r.warnings:
         out.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)

@@ -23,11 +23,9 @@ _REFUSED = (
 )
 
 
-def _table(*columns: str | Column) -> Table:
+def _table(*columns: str) -> Table:
     """Returns a table that continues a long cell in the next line: a narrow output must not lose digits or names."""
-    return Table(
-        *(Column(one, overflow="fold") if isinstance(one, str) else one for one in columns), box=None
-    )
+    return Table(*(Column(one, overflow="fold") for one in columns), box=None, pad_edge=False)
 
 
 def grasp_table(r: "GraspSummary") -> None:
@@ -38,6 +36,7 @@ def grasp_table(r: "GraspSummary") -> None:
     pairs(
         {
             "result": r["result"] + (", fell back to motor current" if r["fell_back"] else ""),
+            **({"reason": r["reason"]} if r["reason"] and r["result"] != "held" else {}),
             "object": r["object"],
             "target": number(r["target_n"], " N", 2),
             "load cell, mean": number(r["load_cell_mean_n"], " N"),
@@ -80,8 +79,9 @@ def trials_table(
     trials: "Sequence[GraspSummary]", summary: "TrialsSummary", figure: str | None = None
 ) -> None:
     """Prints the figures of each trial and over all trials."""
-    names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %", "gain")
-    table = _table(*names, Column("result", no_wrap=True))
+    # 80 columns must do.
+    units = ("target\nN", "load cell\nN", "error\n%", "overshoot\nN", "settle\ns", "vision\n%")
+    table = _table("object", *units, "gain", "result")
     for t in trials:
         error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
         table.add_row(
@@ -124,13 +124,13 @@ def errors_table(r: "Evaluation") -> None:
         figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
         table.add_row(escape(name), *(number(value) for value in figures), str(o.frames))
     out.print(table)
-    _bins_table(r.per_bin)
+    _bins_table(r.per_bin, "visual")
 
 
-def _bins_table(bins: "list[ForceBin]") -> None:
-    table = _table("force N", "MAE N", "bias N", "frames")
+def _bins_table(bins: "list[ForceBin]", source: str) -> None:
+    table = _table("load cell N", f"{source}: MAE N", "bias N", "samples")
     for b in bins:
-        span = f"{b.from_n:.0f}-{b.to_n:.0f}"
+        span = f"{b.from_n:.0f} to {b.to_n:.0f}"
         table.add_row(span, number(b.mae_n), number(b.bias_n), str(b.frames))
     out.print(table)
 
@@ -156,7 +156,7 @@ def replay_table(r: "ReplayResult", report: str | None = None) -> None:
         lag = number(None if s.lag_s is None else 1e3 * s.lag_s, digits=0)
         table.add_row(name, *(number(value) for value in figures), lag, str(s.frames))
     out.print(table)
-    _bins_table(r.per_bin)
+    _bins_table(r.per_bin, "fused" if "fused" in r.sources else "visual")
 
 
 def replays_table(

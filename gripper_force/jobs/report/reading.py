@@ -32,6 +32,7 @@ from gripper_force.types import (
     FusedForce,
     GraspStatus,
     LoadCellSample,
+    Outcome,
     Phase,
     Request,
     RequestKind,
@@ -99,6 +100,7 @@ def read_run(
     forces = _forces(zero_ns, samples, fused, vision)
     errors = _errors(forces)
     uses_vision = controls_with_vision(config)
+    outcome = next((s.outcome for s in reversed(of_grasp) if s.outcome), "")
     # A simulated camera's latency is a constant, and no measurement.
     measured = config.camera.backend != "simulated"
     return Run(
@@ -111,10 +113,10 @@ def read_run(
         begin_s=(log.start_ns - zero_ns) / NS_PER_S,
         end_s=end_s,
         target_n=target_n,
-        outcome=next((s.outcome for s in reversed(of_grasp) if s.outcome), ""),
+        outcome=outcome,
         score=_score(samples, logged_status, target_n, begin_ns),
         vision=vision_in_hold(of_grasp, fused, vision, events) if uses_vision else None,
-        object_gain=_object_gain(fused),
+        object_gain=_object_gain(fused) if outcome == Outcome.HELD else None,
         forces=forces,
         errors=errors,
         std_n=_series(zero_ns, ((r.t_ns, r.std_n) for r in fused)),

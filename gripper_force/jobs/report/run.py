@@ -101,7 +101,8 @@ class Run:
         outcome: Last outcome; empty without one.
         score: Grasp compared with the load cell; None without a hold or a load cell.
         vision: Use of vision in the hold; None without a hold or without vision.
-        object_gain: Last gain of the object by motor current, and its relative standard deviation; None without one.
+        object_gain: Last gain of the object by motor current, and its relative standard deviation; None without one,
+            or if the last grasp was not held: it taught none.
         forces: Force by source; sources that the log lacks are absent.
         errors: Force minus the load cell's force, by source; only where the load cell gives valid samples.
         std_n: Claimed standard deviation of the fused estimate.
