@@ -883,13 +883,14 @@ def test_a_long_path_in_a_pipe_is_one_line(capsys: pytest.CaptureFixture[str]) -
 def test_a_table_of_trials_fits_80_columns_without_a_broken_word(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trial = dict.fromkeys((*GRASP_KEYS, "vision_share", "object_gain", "feedback"))
+    trial: dict[str, Any] = dict.fromkeys((*GRASP_KEYS, "vision_share", "object_gain", "feedback"))
     trial |= {"object": "paper_cup", "target_n": 6.45, "result": "timeout", "fell_back": True}
-    summary = {"fell_back": 0, "peak_n": None, "estimate_mae_n": {}}
+    summary: dict[str, Any] = {"fell_back": 0, "peak_n": None, "estimate_mae_n": {}}
     monkeypatch.setattr(console.out, "width", 80)
     trials_table([cast(GraspSummary, trial)], cast(TrialsSummary, summary))
     said = capsys.readouterr().out
     assert {"paper_cup", "load cell", "overshoot", "timeout,"} <= set(re.split(r"\s{2,}|\n", said))
+    assert max(map(len, said.splitlines()[:4])) <= 80
 
 
 def test_a_setting_that_a_camera_lacks_is_not_shown(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ def summary(
 ) -> GraspSummary:
     return {
         "result": result,
+        "reason": "",
         "object": "sponge",
         "target_n": target_n,
         "seed": 1,
