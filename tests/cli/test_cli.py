@@ -841,7 +841,7 @@ def test_only_a_command_with_a_run_says_that_it_was_stopped(
         raise KeyboardInterrupt
 
     handlers = {number: signal.getsignal(number) for number in process.SIGNALS}
-    monkeypatch.setattr("gripper_force.config.load_config", interrupted)
+    monkeypatch.setattr("gripper_force.config.load_with_options", interrupted)
     try:
         for words in (["grasp"], ["calibrate", "jaws"], ["bench", "gain"], ["doctor"]):
             done = run(*words)
