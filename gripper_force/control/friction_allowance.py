@@ -29,18 +29,19 @@ class FrictionAllowance:
 
     Attributes:
         shown_n: Least friction that a motion has shown; infinite before.
+        was_shown_in_grasp: True if a motion of the present grasp has shown it.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._safe_n = _UNKNOWN_SHARE * config.force_limit_n / transmission.torque_constant_bound
         self._breakaway_n = transmission.friction_n + _BREAKAWAY_N
         self.shown_n = math.inf
-        self._was_shown_in_grasp = self._starts_open = self._has_moved = False
+        self.was_shown_in_grasp = self._starts_open = self._has_moved = False
         self._slow_s = 0.0
 
     def start_grasp(self) -> None:
         """Starts a grasp: what was shown before does not count in its grip."""
-        self._was_shown_in_grasp = False
+        self.was_shown_in_grasp = False
 
     def start_phase(self, *, from_open: bool) -> None:
         """Starts a phase; ``from_open`` is True if its jaws are open and grip nothing."""
@@ -72,13 +73,13 @@ class FrictionAllowance:
         With ``only_lower`` it does not show that friction has risen: jaws that close may press on a soft object.
         """
         if friction_n is not None:
-            self._was_shown_in_grasp = True
+            self.was_shown_in_grasp = True
             self.shown_n = min(friction_n, self.shown_n) if only_lower else friction_n
 
     def allowance_n(self, friction_n: float, *, opening: bool, closing: bool, gripping: bool) -> float:
         """Returns the part of the assumed ``friction_n`` that the current limit may allow for."""
         # In a grip, a sudden motion adds to the static force.
-        if self.shown_n < math.inf and (self._was_shown_in_grasp or not gripping):
+        if self.shown_n < math.inf and (self.was_shown_in_grasp or not gripping):
             return min(friction_n, self.shown_n)
         return friction_n if opening or (closing and self._may_be_stuck) else 0.0
 

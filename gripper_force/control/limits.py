@@ -8,7 +8,8 @@ from gripper_force.errors import NonFiniteError
 from gripper_force.types import ServoCommand
 
 _RISE_FACTOR = 4.0
-"""The motor force may rise this many times as fast as the force ramp, unless the force was over its limit."""
+"""The motor force may rise this many times as fast as the force ramp, unless the force was over its limit or the
+friction is unknown: jaws that a sudden force accelerates compress a soft object by more than the force at rest does."""
 
 _OVER_FORCE_CEILING = 0.95
 """Until the grasp ends, the current stays below this share of a current that caused an over-force."""
@@ -69,6 +70,7 @@ class Limits:
         *,
         may_rise: bool,
         opening: bool = False,
+        rises_slowly: bool = False,
     ) -> tuple[ServoCommand, bool]:
         """Limits a command.
 
@@ -81,6 +83,7 @@ class Limits:
             dt_s: Time since the last command.
             may_rise: True if the goal current may exceed the last one.
             opening: True if the jaws are to open; the current is then not lowered for a force over its limit.
+            rises_slowly: True if the motor force is to rise no faster than the force ramp.
 
         Returns:
             The limited command, and True if the force estimate is over its limit.
@@ -102,7 +105,7 @@ class Limits:
             ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if lowers else 1.0) * self._last_a)
         self._over = over
         rise_a_s = abs(self._transmission.current_a(self._rise_n_s, present_rad))
-        rise_a_s /= 1.0 if self._over_force_ceiling_a == math.inf else _RISE_FACTOR
+        rise_a_s /= _RISE_FACTOR if rises_slowly or self._over_force_ceiling_a < math.inf else 1.0
         wanted_a = min(max(command.goal_current_a, 0.0), self._unrounded_a + rise_a_s * dt_s, ceiling_a)
         self._unrounded_a = wanted_a
         self._last_a = self._quantise(wanted_a, ceiling_a)

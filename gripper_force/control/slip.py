@@ -59,10 +59,8 @@ class SlipMonitor:
         share = dt_s / (dt_s + _FREE_FILTER_S)
         self._closing_m_s += (closing_m_s - self._closing_m_s) * share
         self._shortfall_n += (shortfall_n - self._shortfall_n) * share
-        closes_freely = self._closes(self._closing_m_s)
-        closes_freely = closes_freely and self._shortfall_n > max(
-            _SHORTFALL_SHARE * reference_n, _SHORTFALL_N
-        )
+        free_n = max(_SHORTFALL_SHARE * reference_n, _SHORTFALL_N)
+        closes_freely = self._closes(self._closing_m_s) and self._shortfall_n > free_n
         self._free_s = self._free_s + dt_s if closes_freely else 0.0
         if self._free_s >= _FREE_S:
             return "the jaws close without resistance"

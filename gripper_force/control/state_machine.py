@@ -692,6 +692,7 @@ class GraspController:
             dt_s,
             may_rise=may_rise,
             opening=self._is_opening,
+            rises_slowly=self._phase in GRIPPING and not self._friction.was_shown_in_grasp,
         )
         if self._servo is not None:
             command = self._speed_limit.apply(command, self._servo, self._speed_m_s)

@@ -102,6 +102,25 @@ def test_over_force_halves_within_five_cycles():
     assert out.goal_current_a < 0.1
 
 
+def test_a_grip_whose_friction_is_unknown_rises_with_the_ramp():
+    risen_n = []
+    for rises_slowly in (False, True):
+        limits = Limits(CONFIG, FINE, 1.0)
+        for _ in range(4):
+            out, _ = limits.apply(
+                ServoCommand(0, 0.0, 1.0),
+                0.0,
+                0.0,
+                0.0,
+                0.0,
+                0.005,
+                may_rise=True,
+                rises_slowly=rises_slowly,
+            )
+        risen_n.append(FINE.force_n(out.goal_current_a, 0.0))
+    assert risen_n == pytest.approx([4 * CONFIG.ramp_n_s * 0.02, CONFIG.ramp_n_s * 0.02], abs=0.02)
+
+
 @settings(deadline=None)
 @given(st.floats(1.0, 2.0), st.floats(0.0, 1.0), st.floats(0.0, 1.5), st.floats(2.0, 60.0))
 def test_ceiling_keeps_the_force_limit_for_any_torque_constant(bound, share, believed_n, limit_n):

@@ -106,6 +106,13 @@ def test_a_grasp_that_interrupts_another_motion_is_safe(config: Config, index: i
     assert run_case(config, 0, index).ok
 
 
+def test_a_soft_object_next_to_the_jaws_is_pressed_slowly(config: Config) -> None:
+    # 1.14 times the limit: the jaws had not travelled far enough to show that friction is low.
+    drawn = draw(config.control, RACK, 0, 7205)
+    assert 0.0 < drawn.contact_m - drawn.begins_m < 0.0005
+    assert run_case(config, 0, 7205).force_share < 1.0
+
+
 @pytest.mark.parametrize("index", [732, 5053, 9847])
 def test_a_hold_with_a_small_limit_is_slow_when_its_object_leaves(config: Config, index: int) -> None:
     # 732, 9847: the object returned to jaws that closed with 15 mm/s: 1.9 and 1.4 times the limit. 5053: its loss was
