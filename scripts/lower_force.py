@@ -3,14 +3,15 @@
     python scripts/lower_force.py
 
 Each simulated gripper holds 5 N, and then gets the target 2 N. Prints the error of the load cell's force 0.5 s and 1 s
-after the request, and the time until the new target counts as held. The simulated friction is 0.7, 1 and 1.4 times that
-of the default gripper.
+after the request, and the time until the new target counts as held. For comparison, it also prints the error of a
+grasp that gets the lower target at once. The simulated friction is 0.7, 1 and 1.4 times that of the default gripper.
 """
 
 import argparse
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 import gripper_force as gf
 
@@ -25,7 +26,7 @@ def lower(keys: dict[str, object], before_n: float, after_n: float) -> tuple[lis
 
     None means that the first force was not held.
     """
-    with gf.open_gripper(overrides={"clock": "lockstep", "vision.threads": 1, **keys}) as gripper:
+    with _open(keys) as gripper:
         if gripper.grasp(before_n).outcome != "held":
             return None
         begin_s, errors, held_s = gripper.state.t_ns / 1e9, list[float](), np.inf
@@ -33,11 +34,25 @@ def lower(keys: dict[str, object], before_n: float, after_n: float) -> tuple[lis
         while (now_s := gripper.state.t_ns / 1e9 - begin_s) < END_S:
             gripper.step()
             if len(errors) < len(LATE_S) and now_s >= LATE_S[len(errors)]:
-                sample = gripper.load_cell
-                errors.append(np.nan if sample is None else sample.force_n / after_n - 1)
+                errors.append(_error(gripper, after_n))
             if np.isinf(held_s) and gripper.state.outcome == "held" and now_s > LATE_S[0]:
                 held_s = now_s
         return errors, held_s
+
+
+def grasp(keys: dict[str, object], target_n: float) -> float:
+    """Returns the relative error of a grasp as it is held; NaN if it is not."""
+    with _open(keys) as gripper:
+        return _error(gripper, target_n) if gripper.grasp(target_n).outcome == "held" else np.nan
+
+
+def _open(keys: dict[str, object]) -> gf.Gripper:
+    return gf.open_gripper(overrides={"clock": "lockstep", "vision.threads": 1, **keys})
+
+
+def _error(gripper: gf.Gripper, target_n: float) -> float:
+    sample = gripper.load_cell
+    return np.nan if sample is None else sample.force_n / target_n - 1
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -60,40 +75,42 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "at 1 s",
         "held after s",
         "not held",
+        "grasped at once",
     ]
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
     for feedback in given.feedback:
         camera = {"camera.backend": "none"} if feedback == "current" else {}
         for name in given.object:
-            cases = [
-                lower(
-                    {
-                        "object": name,
-                        "seed": seed,
-                        "sim.friction": friction,
-                        "control.feedback": feedback,
-                        **camera,
-                    },
-                    given.from_n,
-                    given.to_n,
-                )
+            grippers: list[dict[str, object]] = [
+                {
+                    "object": name,
+                    "seed": seed,
+                    "sim.friction": friction,
+                    "control.feedback": feedback,
+                    **camera,
+                }
                 for friction in given.friction
                 for seed in range(1, given.seeds + 1)
             ]
+            cases = [lower(keys, given.from_n, given.to_n) for keys in grippers]
             done = [case for case in cases if case is not None]
             if not done:
-                print(f"| {feedback} | {name} | 0 of {len(cases)} | - | - | - | - |", flush=True)
+                print(f"| {feedback} | {name} | 0 of {len(cases)} | - | - | - | - | - |", flush=True)
                 continue
             shares = np.abs([errors for errors, _ in done])  # (K, 2)
             held_s = np.array([time for _, time in done])
-            early, late = (
-                f"{100 * np.median(column):.1f}, {100 * column.max():.1f} %" for column in shares.T
-            )
+            early, late = (_text(column) for column in shares.T)
+            at_once = _text(np.abs([grasp(keys, given.to_n) for keys in grippers]))
             print(
                 f"| {feedback} | {name} | {len(done)} of {len(cases)} | {early} | {late} | {np.median(held_s):.2f} | "
-                f"{np.isinf(held_s).sum()} |",
+                f"{np.isinf(held_s).sum()} | {at_once} |",
                 flush=True,
             )
+
+
+def _text(shares: npt.NDArray[np.float64]) -> str:
+    """Returns median and largest error, of those that are known."""
+    return f"{100 * np.nanmedian(shares):.1f}, {100 * np.nanmax(shares):.1f} %"
 
 
 if __name__ == "__main__":
