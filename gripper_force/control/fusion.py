@@ -29,12 +29,12 @@ _FRAME_NOISE_N = 0.15
 """Standard deviation from frame to frame of a still scene. The rest of the claimed error is constant."""
 
 _INERTIA_SHARE = 0.4
-"""Standard deviation of the current estimate after an impact, or after the force was lowered, as a share of friction:
-inertia carries the jaws to anywhere within it."""
+"""Standard deviation of the current estimate after an impact, as a share of friction: inertia carries the jaws to
+anywhere within it."""
 
 _PLAY_SHARE = 0.15
 """Error of a steady current estimate after the motor force has fallen within the play, as a share of friction and of
-the reversal: 0.11 N at 60 % in simulated grasps."""
+the reversal: 0.11 N at 60 % in simulated grasps. After the force was lowered it is this share of friction."""
 
 _REENTRY_S = 1 / 3
 _MIN_REENTRY = 4
@@ -165,7 +165,7 @@ class Fusion:
             The estimate, and an event if vision drops out or returns, or if its first estimate is rejected.
         """
         self._has_lowered = (self._has_lowered or lowering) and not free
-        unknown_share = 1.0 if opening else _INERTIA_SHARE if self._has_lowered else 0.0
+        unknown_share = 1.0 if opening else _PLAY_SHARE if self._has_lowered else 0.0
         self._opening_variance_n2 = (self.current.friction_n * unknown_share) ** 2
         if self._was_lowering and not lowering:
             self.reset_variance()

@@ -274,6 +274,17 @@ def test_while_the_force_is_lowered_the_difference_by_the_gearing_falls_with_it(
     assert 0.25 * before.bias_n > after.bias_n > 0.75 * before.bias_n
 
 
+def test_after_a_lowering_known_friction_still_counts(bench, transmission):
+    """With 0.4 times the friction as its error, the motor current had a quarter of the weight of vision."""
+    b, friction_n = bench(), transmission.friction_n
+    b.run(0.3, lambda _: friction_n, lambda _: 0.0, free=True)
+    b.run(2.0, lambda _: 5.0 + friction_n, lambda _: 5.0, gripping=True, holding=True)
+    b.run(0.3, lambda _: 2.0 - friction_n, lambda _: 2.0, gripping=True, lowering=True)
+    after = b.run(1.0, lambda _: 2.0, lambda _: 1.8, std_n=0.2, gripping=True, holding=True)
+    share = after.bias_n / (1.8 - after.current_n)
+    assert 0.4 < share < 0.6
+
+
 def test_without_a_lowering_the_difference_stays(bench, transmission):
     b = bench()
     before = b.run(3.0, lambda _: 8.0 + transmission.friction_n, lambda _: 7.0)
