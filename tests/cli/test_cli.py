@@ -560,7 +560,9 @@ def test_a_report_can_be_that_of_a_replay(run: Run, fused_log: Path, tmp_path: P
     assert "open loop" not in (tmp_path / "run.html").read_text(encoding="utf-8")
 
 
-def test_a_folder_is_replayed(run: Run, fused_log: Path, tmp_path: Path) -> None:
+def test_a_folder_is_replayed(
+    run: Run, fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("a", "b"):
         shutil.copy(fused_log, tmp_path / f"{name}.mcap")
     found = run("replay", tmp_path, "--json", "--jobs", 1).json()
@@ -570,9 +572,12 @@ def test_a_folder_is_replayed(run: Run, fused_log: Path, tmp_path: Path) -> None
     assert "a.mcap" in table.out
     assert "stapler" in table.out
     long = (tmp_path / "b.mcap").rename(tmp_path / f"{'20261128-094116-' * 4}sponge.mcap")
+    assert long.name in run("replay", tmp_path, "--jobs", 1).out
+    monkeypatch.setattr(console.out, "width", 80)
     table = run("replay", tmp_path, "--jobs", 1)
-    names = "".join(line.split(" ")[1] for line in table.out.splitlines()[1:7])
-    assert long.name in names  # an output of 80 columns cuts nothing off
+    assert max(map(len, table.out.splitlines())) <= 80
+    names = "".join(line.split(" ")[0] for line in table.out.splitlines()[1:7])
+    assert long.name in names  # a terminal of 80 columns cuts nothing off
 
 
 def test_two_settings_are_compared(run: Run, fused_log: Path, tmp_path: Path, tiny_checkpoint: Path) -> None:
