@@ -99,18 +99,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 continue
             shares = np.abs([errors for errors, _ in done])  # (K, 2)
             held_s = np.array([time for _, time in done])
-            early, late = (_text(column) for column in shares.T)
-            at_once = _text(np.abs([grasp(keys, given.to_n) for keys in grippers]))
+            early, late = (_median_and_largest(column) for column in shares.T)
+            at_once = np.abs([grasp(keys, given.to_n) for keys in grippers])
+            held = at_once[~np.isnan(at_once)]
+            shown = f"{_median_and_largest(held) if held.size else '-'} ({held.size} of {at_once.size})"
             print(
                 f"| {feedback} | {name} | {len(done)} of {len(cases)} | {early} | {late} | {np.median(held_s):.2f} | "
-                f"{np.isinf(held_s).sum()} | {at_once} |",
+                f"{np.isinf(held_s).sum()} | {shown} |",
                 flush=True,
             )
 
 
-def _text(shares: npt.NDArray[np.float64]) -> str:
-    """Returns median and largest error, of those that are known."""
-    return f"{100 * np.nanmedian(shares):.1f}, {100 * np.nanmax(shares):.1f} %"
+def _median_and_largest(shares: npt.NDArray[np.float64]) -> str:
+    return f"{100 * np.median(shares):.1f}, {100 * shares.max():.1f} %"
 
 
 if __name__ == "__main__":

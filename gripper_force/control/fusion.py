@@ -34,7 +34,7 @@ anywhere within it."""
 
 _PLAY_SHARE = 0.15
 """Error of a steady current estimate after the motor force has fallen within the play, as a share of friction and of
-the reversal: 0.11 N at 60 % in simulated grasps. After the force was lowered it is this share of friction."""
+the reversal: 0.11 N at 60 % in simulated grasps. After a lowering: as a share of friction alone."""
 
 _REENTRY_S = 1 / 3
 _MIN_REENTRY = 4

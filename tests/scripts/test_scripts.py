@@ -23,7 +23,7 @@ def test_lower_force_prints_a_row_per_object_and_feedback() -> None:
     shown = run("lower_force.py", *arguments).stdout.splitlines()
     assert len(shown) == 3
     assert shown[2].startswith("| current | stapler | 1 of 1 |")
-    assert re.search(r"\| 0 \| (\d+\.\d), \1 % \|$", shown[2])
+    assert re.search(r"\| 0 \| (\d+\.\d), \1 % \(1 of 1\) \|$", shown[2])
 
 
 def test_lost_object_prints_the_time_to_slip() -> None:
