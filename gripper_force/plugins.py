@@ -99,7 +99,7 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
         ) from error
     if not callable(found):
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
-    if isinstance(found, type) or group == "servos":  # a servo's class is asked for its `spec` first
+    if isinstance(found, type) or group == "servos":  # `spec` is read before a servo is made
         _check_methods(found, group, f"{key}={name}: {target}")
     return found if name in builtin else _Plugin(found, group, f"{key}={name}: {attribute}")
 
