@@ -80,7 +80,7 @@ class FaultyEstimator:
                 self._clock.sleep_until_ns(self._faults.end_ns("estimator", now_ns))
             return None
         estimate: ForceEstimate | None = self._estimator.update(gray)
-        if estimate is None or kind == "ok":
+        if estimate is None or kind not in ("garbage", "wrong"):
             return estimate
         force_n = _WRONG_GAIN * estimate.force_n
         if kind == "garbage":
