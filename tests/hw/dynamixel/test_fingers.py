@@ -111,6 +111,10 @@ def test_wrong_pairs_are_refused() -> None:
         (["servo.second.id=2", "gripper.linkage={kind: finger, finger_m: 0.06}"], "set the kind to fingers"),
         (["faults=[{unit: servo, kind: off, id: 2}]"], "no servo has it"),
         (["servo.second.id=2", "faults=[{unit: bus, kind: off, id: 2}]"], "bus has no id"),
+        (
+            ["servo.second.id=2", "faults=[{unit: plant, kind: off, id: 2}]"],
+            "kind off of unit plant has no id",
+        ),
     ):
         with pytest.raises(ConfigError, match=text):
             load_config(None, sets)
