@@ -19,7 +19,7 @@ class CounterMonitor:
         if counts == self._reported or (t_ns < self._next_ns and not at_end):
             return ""
         risen = {cause: count - self._reported.get(cause, 0) for cause, count in counts.items()}
-        self._reported = counts
+        self._reported = dict(counts)  # a device may return the same dictionary each time
         news = [f"{count} {cause.replace('_', ' ')}" for cause, count in risen.items() if count]
         if news:
             self._next_ns = t_ns + NS_PER_S

@@ -36,3 +36,10 @@ def test_counts_that_rise_are_told_once_a_second_and_at_the_end() -> None:
     assert tally.update(2, {"spikes": 5, "losses": 1}, at_end=False) == ""
     assert tally.update(NS_PER_S + 1, {"spikes": 6, "losses": 1}, at_end=False) == "4 spikes, 1 losses"
     assert tally.update(NS_PER_S + 2, {"spikes": 7, "losses": 1}, at_end=True) == "1 spikes"
+
+
+def test_counts_in_one_dictionary_that_the_device_goes_on_changing_are_told() -> None:
+    tally, counts = CounterMonitor(), {"spikes": 0}
+    assert tally.update(0, counts, at_end=False) == ""
+    counts["spikes"] = 2
+    assert tally.update(1, counts, at_end=False) == "2 spikes"
