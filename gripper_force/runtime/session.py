@@ -232,9 +232,7 @@ class Session:
         inputs: tuple[Record, ...] = (state,) if request is None else (request, state)
         for record in (*inputs, decision.estimate, decision.command, decision.status, *decision.events):
             self._log(record)
-        # A sensor that ended the run would raise again while the jaws open at the end.
-        with nullcontext() if self._error is None else suppress(GripperError):
-            self._log_sensors(state.t_ns)
+        self._log_sensors(state.t_ns)
         return decision
 
     def _poll_perception(self) -> VisualForce | None:
@@ -354,22 +352,24 @@ class Session:
 
     def _log_sensors(self, t_ns: int, *, at_end: bool = False) -> None:
         devices = self._devices
-        if devices.load_cell is not None:
-            samples = devices.load_cell.drain()
-            for sample in samples:
-                self._log(sample)
-                if sample.valid:
-                    self.last_load_cell_sample = sample
-            if text := self._load_cell_monitor.update(t_ns, samples):
-                self._log(Event(t_ns, "load_cell", text))
-        counts = {"servo": {"bus retries": devices.servo.stats.retries}}
-        if devices.camera is not None:
-            counts["camera"] = devices.camera.counts()
-        if devices.load_cell is not None:
-            counts["load_cell"] = devices.load_cell.counts()
-        for unit, count in counts.items():
-            if text := self._counter_monitors[unit].update(t_ns, count, at_end=at_end):
-                self._log(Event(t_ns, unit, text))
+        # After an error, one of a sensor would end the opening of the jaws, or hide the first error.
+        with nullcontext() if self._error is None else suppress(GripperError):
+            if devices.load_cell is not None:
+                samples = devices.load_cell.drain()
+                for sample in samples:
+                    self._log(sample)
+                    if sample.valid:
+                        self.last_load_cell_sample = sample
+                if text := self._load_cell_monitor.update(t_ns, samples):
+                    self._log(Event(t_ns, "load_cell", text))
+            counts = {"servo": {"bus retries": devices.servo.stats.retries}}
+            if devices.camera is not None:
+                counts["camera"] = devices.camera.counts()
+            if devices.load_cell is not None:
+                counts["load_cell"] = devices.load_cell.counts()
+            for unit, count in counts.items():
+                if text := self._counter_monitors[unit].update(t_ns, count, at_end=at_end):
+                    self._log(Event(t_ns, unit, text))
 
 
 @contextmanager

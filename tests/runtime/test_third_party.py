@@ -190,6 +190,21 @@ def test_the_jaws_open_after_a_fault_although_a_sensor_fails_again(
         assert list(LogReader(path).records(GraspStatus))[-1].width_m > 0.085
 
 
+@pytest.mark.parametrize(("unit", "method"), [("camera", "counts"), ("load_cell", "drain")])
+def test_a_sensor_that_fails_at_the_end_does_not_hide_the_error_before(
+    config: Config, unit: str, method: str
+) -> None:
+    settings = resolve(with_own(config, unit, ""))
+    with (
+        open_devices(settings.config) as devices,
+        pytest.raises(ZeroDivisionError),
+        open_session(settings, devices, None) as session,
+    ):
+        session.wait_for_reference()
+        getattr(devices, unit)._part.fails = method
+        raise ZeroDivisionError
+
+
 def test_the_settings_of_a_camera_may_be_of_numpy(config: Config, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     run_grasp(with_own(config, "camera", ""), path)
