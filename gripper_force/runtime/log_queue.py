@@ -3,6 +3,7 @@
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from gripper_force.errors import LogError
@@ -50,11 +51,9 @@ class LogQueue:
     def close(self) -> None:
         """Writes the waiting records and completes the log. May be called twice."""
         if self._thread is not None:
-            try:
+            with suppress(queue.Full):  # the thread is blocked
                 self._queue.put(None, timeout=_TIMEOUT_S)
                 self._thread.join(_TIMEOUT_S)
-            except queue.Full:
-                pass  # the thread is blocked
             if self._thread.is_alive():
                 self.lost += self._queue.qsize()
                 self._error = f"the disk did not take the last records within {_TIMEOUT_S:g} s"
@@ -90,11 +89,9 @@ class LogQueue:
     def _count(self, write: Callable[[], None]) -> None:
         try:
             write()
-        except LogError as error:
-            self._lose(str(error))
         # If the thread ended here, all later records would be lost without a message.
         except Exception as error:
-            self._lose(f"{type(error).__name__}: {error}")
+            self._lose(str(error) if isinstance(error, LogError) else f"{type(error).__name__}: {error}")
 
     def _lose(self, why: str) -> None:
         self.lost += 1

@@ -79,6 +79,8 @@ class LogWriter:
             self.attach(CONFIG_NAME, config.encode(), "application/yaml")
         except LogError:
             self.close()
+            with contextlib.suppress(OSError):
+                path.unlink()  # the next run with this name would be refused because of an empty file
             raise
 
     def __enter__(self) -> Self:

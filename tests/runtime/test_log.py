@@ -3,7 +3,7 @@ import io
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, BinaryIO, get_args
 
 import numpy as np
 import pytest
@@ -18,6 +18,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from gripper_force.errors import ConfigError, LogError
+from gripper_force.fault_config import FaultConfig
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.runtime.log_codecs import CODECS, INTERVAL_STD, UTC_NAME
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import CHUNK_NS, LogWriter
@@ -34,6 +36,7 @@ from gripper_force.types import (
     ServoState,
     VisualForce,
 )
+from gripper_hw.fault_injection import Faults, FaultyFile
 
 TIMES = st.integers(0, 2**63 - 1)
 BY_TYPE: dict[Any, st.SearchStrategy[Any]] = {
@@ -542,6 +545,17 @@ def test_a_full_disk_is_one_typed_error_that_stays_and_leaves_a_prefix(
         times = [r.t_ns for r in LogReader(path, recover=True).records(FusedForce)]
         assert times == [i * NS_PER_MS for i in range(len(times))]
         assert bool(times) == (room >= 6000)
+
+
+def test_a_log_that_can_not_be_begun_leaves_no_file(tmp_path: Path) -> None:
+    path, full = tmp_path / "run.mcap", Faults([FaultConfig(unit="disk", kind="off")])
+
+    def broken(file: BinaryIO) -> Any:
+        return FaultyFile(file, full, MonotonicClock(), lockstep=False)
+
+    with pytest.raises(LogError, match=r"run\.mcap: No space left on device"):
+        LogWriter(path, config="", metadata={}, wrap_file=broken)
+    LogWriter(path, config="", metadata={}).close()
 
 
 def test_a_closed_log_takes_no_more_and_may_be_closed_again(tmp_path: Path) -> None:
