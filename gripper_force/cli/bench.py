@@ -257,7 +257,7 @@ def bus(
 @app.command("loop", cls=ViewCommand)
 def loop(
     seconds: Annotated[
-        float, typer.Option(min=1.0, help="Duration with inference, and again without it.")
+        float, typer.Option(min=1.0, max=1e9, help="Duration with inference, and again without it.")
     ] = 30.0,
     view: Annotated[
         str | None,
@@ -397,7 +397,7 @@ def commands(set_: NoOverrides = None, as_json: AsJson = False) -> None:
 @app.command("training")
 def training(
     data: Annotated[Path, typer.Argument(help="Folder with logs to train on.")],
-    minutes: Annotated[float, typer.Option(min=0.01, help="Training time of each recipe.")] = 30.0,
+    minutes: Annotated[float, typer.Option(min=0.01, max=1e9, help="Training time of each recipe.")] = 30.0,
     folder: Folder = Path("runs/bench"),
     jobs: Jobs = CORES,
     set_: Annotated[

@@ -63,7 +63,9 @@ def load_cell(
     mass_kg: Annotated[float | None, typer.Option(help="Known mass to put on the load cell.")] = None,
     force_n: Annotated[float | None, typer.Option(help="Its weight in newtons, instead of the mass.")] = None,
     rig: RigPath = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Duration of the readings of each load.")] = 10.0,
+    seconds: Annotated[
+        float, typer.Option(min=1, max=3600, help="Duration of the readings of each load.")
+    ] = 10.0,
     yes: Annotated[
         bool, typer.Option("--yes", help="Do not wait for Enter: continue when the reading is at rest.")
     ] = False,

@@ -177,7 +177,7 @@ def fuzz(
 
 @app.command("soak")
 def soak(
-    seconds: Annotated[float, typer.Option(min=0, help="Simulated seconds of grasps.")] = 600.0,
+    seconds: Annotated[float, typer.Option(min=0, max=1e9, help="Simulated seconds of grasps.")] = 600.0,
     seed: Seed = None,
     config: ConfigPath = None,
     set_: Overrides = None,

@@ -815,6 +815,21 @@ def test_options_without_effect_are_refused(run: Run) -> None:
         assert f"{name} only applies to several grasps; add --trials, or leave out {name}" in done.err
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["stability", "soak", "--seconds"],
+        ["calibrate", "load-cell", "--mass-kg", 1, "--seconds"],
+        ["bench", "loop", "--seconds"],
+        ["bench", "training", "logs", "--minutes"],
+    ],
+    ids=lambda words: words[1],
+)
+def test_an_infinite_duration_is_refused(run: Run, words: list[object]) -> None:
+    done = run(*words, "inf")
+    assert (done.code, f"Invalid value for '{words[-1]}'" in done.err) == (2, True), done.err
+
+
 def test_a_simulation_of_nothing_is_refused(run: Run) -> None:
     done = run("simulate", "--presses", 0, "--grasps", 0)
     assert (done.code, "there is nothing to simulate; give --presses" in done.err) == (2, True)
