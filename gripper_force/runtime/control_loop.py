@@ -237,6 +237,8 @@ class ControlLoop:
             if error is not self._end_error:
                 self._error = error
         finally:
+            if self.owner() is None:  # nobody else will, and Python would keep a lost gripper until its end
+                atexit.unregister(self._close_at_exit)
             self._requests.close()
             self._opened.set()
             self._ended.set()

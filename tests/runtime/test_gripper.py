@@ -1,4 +1,5 @@
 import asyncio
+import gc
 import math
 import re
 import signal
@@ -6,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -1059,6 +1061,11 @@ def test_a_gripper_that_is_lost_is_closed(
     assert (process._interrupts, signal.getsignal(signal.SIGINT)) == ([], before)
     assert opening[0]._ended.wait(60)
     assert torque(server) == 0
+    thread, kept = opening[0]._thread, weakref.ref(opening.pop())
+    assert thread is not None
+    thread.join()
+    gc.collect()
+    assert kept() is None
     with gf.open_gripper(overrides=sets) as again:  # the port is free
         assert again.state.phase == gf.Phase.OPEN
 
