@@ -73,8 +73,7 @@ class FaultConfig(Section):
     at_s: NonNegative = Field(0.0, description="start, seconds after the start of the run")
     for_s: Annotated[float, Field(gt=0)] = Field(float("inf"), description="duration in seconds")
     id: int | None = Field(
-        None,
-        description="servo, plant (not off): id of the only servo that has the fault; None: every one on the bus",
+        None, description="servo, plant (not off): id of the only servo that fails; None: all on the bus"
     )
 
     @model_validator(mode="after")
@@ -82,8 +81,7 @@ class FaultConfig(Section):
         if self.kind != "ok" and self.kind not in FAULTS[self.unit]:
             known = ", ".join(("ok", *FAULTS[self.unit]))
             raise ValueError(f"unit {self.unit} has no fault kind {self.kind}; choose one of {known}")
-        has_id = self.unit == "servo" or (self.unit == "plant" and self.kind != "off")
-        if self.id is not None and not has_id:
+        if self.id is not None and self.unit != "servo" and (self.unit != "plant" or self.kind == "off"):
             raise ValueError(f"kind {self.kind} of unit {self.unit} has no id; leave it out")
         if (self.unit, self.kind) == ("clock", "stuck") and self.for_s == float("inf"):
             raise ValueError("a clock that stands still for good lets no run end; give for_s")
