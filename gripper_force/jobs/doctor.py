@@ -125,7 +125,10 @@ def _network(config: Config) -> Iterator[Check]:
     from gripper_force.vision.step_benchmark import engine_version
 
     config, model, _ = resolve_vision(config)
-    estimator = make_estimator(ResolvedConfig(config, model))
+    whole = config.with_values(
+        vision={"region": None}
+    )  # a region of the camera's frames, which can be larger
+    estimator = make_estimator(ResolvedConfig(whole, model))
     assert estimator is not None  # the configuration has vision
     vision = config.vision
     package = f"{vision.engine} {engine_version(vision.engine)}".strip()

@@ -104,6 +104,16 @@ def test_the_table_is_for_people(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
+def test_a_region_is_compared_with_the_frames_of_the_camera(quick_vision: list[str]) -> None:
+    config = load_config(None, [*quick_vision, "vision.region=[100, 100, 250, 250]"])
+    assert all(check.ok is not False for check in doctor._network(config))
+    *_, last = doctor.check_unit(config, "camera")
+    assert last.ok is False
+    assert "must lie within the camera's frame of 128x128 pixels" in last.found
+    within = config.with_values(vision={"region": (20, 20, 100, 100)})
+    assert all(check.ok is not False for check in doctor.check_unit(within, "camera"))
+
+
 @pytest.mark.parametrize(("median_ms", "good"), [(12.0, True), (70.0, False)])
 def test_a_network_that_is_slower_than_the_camera_has_alternatives(
     median_ms: float, good: bool, quick_vision: list[str], monkeypatch: pytest.MonkeyPatch

@@ -11,6 +11,7 @@ from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_on
 from gripper_force.runtime.backends import open_devices
 from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS, Frame
+from gripper_force.vision.preprocess import downscale
 from gripper_hw.cameras import uvc
 
 _SYSFS = Path("/sys")
@@ -34,6 +35,7 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
         sysfs: The kernel's list of devices.
 
     Raises:
+        ConfigError: ``vision.region`` reaches beyond the frames.
         GripperError: See `open_devices` and the camera's ``start``.
     """
     for name in (*_oak_devices(), *_video_devices(sysfs / "class/video4linux")):
@@ -106,6 +108,8 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
     found = f"median {latency_ms:.1f} ms from exposure to use"
     advice = f"every estimate would be older than control.vision_age_ms={limit_ms:.3g}: shorten the exposure"
     yield judged("camera", "latency", found, latency_ms < limit_ms, advice)
+    if config.uses_vision:
+        downscale(frames[0].gray, config.vision.region, 1)  # raises if the region reaches beyond the frame
 
 
 def _oak_devices() -> Iterator[str]:
