@@ -207,7 +207,7 @@ def teach(
     real: list[job.RecordingRow] = []
     if recordings is not None:
         with console.err.status("teaching") as status:
-            for found in job.bench_recordings(recordings, folder, lambda text, steps=1: status.update(text)):
+            for found in job.bench_recordings(recordings, folder, console.status_text(status)):
                 real.append(found)
                 console.line(f"{found.object}, {found.trials} trials: {found.taught_n:.2f} N")
         text = job.recordings_markdown(real)
@@ -245,7 +245,6 @@ def bus(
     """Measure a cycle of the servo bus: the driver alone and beside an arm, a plain SDK loop, bare bytes."""
     from gripper_force.qualification.bench import bus_bench
 
-    _reject_overrides("bus", set_)
     costs: list[bus_bench.BusCost] = []
     with console.bar("measuring", len(bus_bench.BUS_SETTINGS)) as progress:
         for setting in bus_bench.bus(cycles):
@@ -300,7 +299,6 @@ def replay(
     from gripper_force.qualification.bench import replay_bench
     from gripper_force.qualification.markdown_blocks import write_between
 
-    _reject_overrides("replay", set_)
     load = os.getloadavg()[0]
     with TemporaryDirectory() as name:
         if logs is None:
@@ -345,7 +343,6 @@ def startup(set_: NoOverrides = None, as_json: AsJson = False) -> None:
     """Measure the time and memory of each kind of scene up to its first control cycle."""
     from gripper_force.qualification.bench import startup_bench
 
-    _reject_overrides("startup", set_)
     rows: list[startup_bench.Start] = []
     with console.bar("starting", len(startup_bench.STARTUP_CASES)) as progress:
         for row in startup_bench.startup(startup_bench.STARTUP_CASES):
@@ -367,7 +364,6 @@ def scene(
     from gripper_force.qualification.bench import scene_bench
     from gripper_force.qualification.markdown_blocks import write_between
 
-    _reject_overrides("scene", set_)
     if write is not None and objects:
         raise ConfigError("--write needs all objects; leave out --object")
     rows: list[scene_bench.SceneCost] = []
@@ -385,7 +381,6 @@ def commands(set_: NoOverrides = None, as_json: AsJson = False) -> None:
     """Measure the time and memory of most commands."""
     from gripper_force.qualification.bench import command_bench
 
-    _reject_overrides("commands", set_)
     costs: list[command_bench.CommandCost] = []
     with console.bar("running", len(command_bench.COMMANDS)) as progress:
         for cost in command_bench.commands():
@@ -433,7 +428,7 @@ def checkpoints(
         bool, typer.Option("--write", help="Write the errors into the checkpoints; their digests stay.")
     ] = False,
     jobs: Jobs = CORES,
-    set_: Overrides = None,
+    set_: NoOverrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the errors of checkpoints on the same logs, so that `vision.checkpoint=auto` can compare them."""
@@ -443,7 +438,6 @@ def checkpoints(
     from gripper_force.jobs.training.stated_errors import state_errors
     from gripper_force.vision.preprocess import Preprocess
 
-    _reject_overrides("checkpoints", set_)
     logs = find_logs(data)
 
     def read(preprocess: Preprocess) -> Sequence[Clip]:
@@ -454,11 +448,6 @@ def checkpoints(
 
     found = state_errors(checkpoint, read, write=write)
     _show({"checkpoints": found}, as_json, lambda: checkpoints_table(found))
-
-
-def _reject_overrides(command: str, overrides: list[str] | None) -> None:
-    if overrides:
-        raise ConfigError(f"bench {command} uses no configuration; leave out --set {overrides[0]}")
 
 
 def _show(result: Mapping[str, object], as_json: bool, table: Callable[[], None]) -> None:

@@ -13,6 +13,7 @@ from gripper_force.cli.options import (
     AsJson,
     ConfigPath,
     Jobs,
+    NoOverrides,
     Overrides,
     again,
     load_settings,
@@ -24,8 +25,6 @@ from gripper_force.plugins import require
 from gripper_force.runtime import process
 
 if TYPE_CHECKING:
-    from rich.status import Status
-
     from gripper_calibration.procedures.calibrate_camera import CameraResult
     from gripper_calibration.procedures.calibrate_load_cell import LoadCellResult
     from gripper_calibration.procedures.calibrate_object import ObjectCalibration
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from gripper_calibration.procedures.teach import Taught
     from gripper_force.config import Config
     from gripper_force.profiles.object_profile import ObjectProfile
-    from gripper_force.progress import Progress
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -88,7 +86,7 @@ def load_cell(
             path,
             prompt=console.prompt(yes, status),
             seconds=seconds,
-            progress=_progress(status),
+            progress=console.status_text(status),
         )
     _show_rig(result, as_json)
     _next_step(["calibrate", "servo", "--gauge-mm", "MM"], config, set_, path)
@@ -108,7 +106,7 @@ def jaws(
 
     settings, _ = load_settings_before_rig(config, set_, {})
     with console.err.status("moving") as status:
-        result = job(settings, prompt=console.prompt(yes, status), progress=_progress(status))
+        result = job(settings, prompt=console.prompt(yes, status), progress=console.status_text(status))
     console.show(result, as_json, jaws_table)
     if settings.load_cell.backend == "none":
         words = ["grasp"]
@@ -145,7 +143,7 @@ def servo(
             [width / 1e3 for width in gauge_mm],
             path,
             prompt=console.prompt(yes, status),
-            progress=_progress(status),
+            progress=console.status_text(status),
         )
     _show_rig(result, as_json)
     if (text := result.width_remark) is not None:
@@ -176,7 +174,7 @@ def weight(
         )
     with console.err.status("moving") as status:
         result = job.calibrate_weight(
-            settings, mass_kg, prompt=console.prompt(yes, status), progress=_progress(status)
+            settings, mass_kg, prompt=console.prompt(yes, status), progress=console.status_text(status)
         )
     console.show(
         console.jsonable(result) | {"settings": result.settings}, as_json, lambda _: weight_table(result)
@@ -227,7 +225,7 @@ def camera(
             region=None if region is None else _region(region),
             exposures_us=exposure_us,
             touches=touches,
-            progress=_progress(status),
+            progress=console.status_text(status),
         )
     for text in result.outdated:
         console.warn(
@@ -314,7 +312,7 @@ def network(
     out: Annotated[Path, typer.Option("--out", help="Checkpoint to write; it may be the same file.")],
     checkpoint: Annotated[str, typer.Option(help="Path of a checkpoint, or default or small.")] = "default",
     jobs: Jobs = CORES,
-    set_: Overrides = None,
+    set_: NoOverrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Fit a network's out-of-distribution score and claimed errors to logs of what it knows."""
@@ -322,8 +320,6 @@ def network(
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.training.ood_fit import calibrate_network
 
-    if set_:
-        raise ConfigError(f"calibrate network uses no configuration; leave out --set {set_[0]}")
     logs = find_logs(data)
     with console.bar("calibrating", 2 * len(logs)) as progress:
         model = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
@@ -563,7 +559,3 @@ def _region(text: str) -> tuple[int, int, int, int]:
     except ValueError:
         raise ConfigError(f"--region needs left,top,width,height in pixels, got {text!r}") from None
     return left, top, width, height
-
-
-def _progress(status: "Status") -> "Progress":
-    return lambda text, steps=1: status.update(text)

@@ -87,8 +87,6 @@ def file(
     as_json: AsJson = False,
 ) -> None:
     """Print a file that comes with the package: an example, the udev rules, or the layout for Foxglove."""
-    if set_:
-        raise ConfigError(f"config file uses no configuration; leave out --set {set_[0]}")
     files = shipped_files()
     if name is None:
         console.show({key: str(path) for key, path in files.items()}, as_json)

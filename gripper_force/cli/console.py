@@ -81,6 +81,31 @@ def line(text: str, steps: int = 1) -> None:
     err.print(f"[dim]{escape(text)}[/]", soft_wrap=True)
 
 
+def status_text(status: "Status") -> "Progress":
+    """Returns a callback that shows each report of progress as the text of a status line."""
+    return lambda text, steps=1: status.update(text)
+
+
+@contextmanager
+def answering(unanswered: str) -> Iterator[None]:
+    """Asks a question of typer's in its block.
+
+    Args:
+        unanswered: Text of the error if the input ends.
+
+    Raises:
+        ConfigError: The input has ended.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    try:
+        yield
+    except typer.Abort as abort:
+        err.print()
+        if not isinstance(abort.__context__, EOFError):
+            raise KeyboardInterrupt from abort  # typer would end with code 1
+        raise ConfigError(unanswered) from abort
+
+
 def warn(text: str) -> None:
     """Prints a warning on stderr."""
     err.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from gripper_force.errors import ConfigError
+
 if TYPE_CHECKING:  # --help needs no configuration
     from gripper_force.config import Config
 
@@ -16,8 +18,20 @@ ConfigPath = Annotated[Path | None, typer.Option("--config", help="YAML file wit
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", help="Set one configuration key: key.path=value. Repeatable.")
 ]
+
+
+def _refuse_overrides(context: typer.Context, overrides: list[str] | None) -> None:
+    """Raises `ConfigError` that names the command if there are overrides."""
+    if overrides:
+        command = context.command_path.partition(" ")[2]
+        raise ConfigError(f"{command} uses no configuration; leave out --set {overrides[0]}")
+
+
 NoOverrides = Annotated[
-    list[str] | None, typer.Option("--set", help="Not allowed: this command uses no configuration.")
+    list[str] | None,
+    typer.Option(
+        "--set", help="Not allowed: this command uses no configuration.", callback=_refuse_overrides
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]

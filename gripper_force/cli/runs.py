@@ -487,12 +487,6 @@ def virtual_servo(
 
 def _confirmed(servo: str, changes: "list[RegisterChange]", yes: bool) -> bool:
     changes_table(servo, changes)
-    try:
+    unanswered = f"the question was not answered, so nothing was written to {servo}; pass --yes in scripts"
+    with console.answering(unanswered):
         return yes or typer.confirm(f"Write these to {servo}?", err=True)
-    except typer.Abort as abort:
-        console.err.print()
-        if not isinstance(abort.__context__, EOFError):
-            raise KeyboardInterrupt from abort  # typer would end with code 1
-        raise ConfigError(
-            f"the question was not answered, so nothing was written to {servo}; pass --yes in scripts"
-        ) from abort

@@ -54,7 +54,7 @@ def setup(
     with console.err.status("setting up") as status:
         person = _Terminal(yes, status)
         try:
-            for report in running.run(person, lambda text, steps=1: status.update(text)):
+            for report in running.run(person, console.status_text(status)):
                 step_lines(report)
                 reports.append(report)
         except (GripperError, KeyboardInterrupt):
@@ -124,12 +124,7 @@ class _Terminal:
 
     def _ask(self, question: str, ask: Callable[[], T], option: str) -> T:
         self._status.stop()
-        try:
+        with console.answering(f"this was not answered: {question}; pass {option} in scripts"):
             answer = ask()
-        except typer.Abort as abort:
-            console.err.print()
-            if not isinstance(abort.__context__, EOFError):
-                raise KeyboardInterrupt from abort  # typer would end with code 1
-            raise ConfigError(f"this was not answered: {question}; pass {option} in scripts") from abort
         self._status.start()
         return answer

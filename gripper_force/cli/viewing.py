@@ -52,8 +52,6 @@ def view(
     """Show a log in Rerun or Foxglove: frames, attention, forces, phases and events on one timeline."""
     from gripper_force.jobs import view as job
 
-    if set_:
-        raise ConfigError(f"view uses no configuration; leave out --set {set_[0]}")
     if save is not None and save.suffix != ".rrd":
         raise ConfigError(f"--save writes a file for Rerun, not {save}; name one that ends with .rrd")
     if port is not None and viewer != "foxglove":

@@ -808,6 +808,23 @@ def test_a_path_that_cannot_be_used_is_one_sentence(run: Run) -> None:
     assert Path("notes.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["view", "run.mcap"],
+        ["config", "file"],
+        ["calibrate", "network", "logs", "--out", "x.safetensors"],
+        ["bench", "checkpoints", "logs", "--checkpoint", "default"],
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_a_command_that_uses_no_configuration_says_so(run: Run, words: list[str]) -> None:
+    done = run(*words, "--set", "seed=2")
+    name = " ".join(words[: 1 if words[0] == "view" else 2])
+    assert (done.code, f"{name} uses no configuration; leave out --set seed=2" in done.err) == (2, True)
+    assert "Not allowed" in run(*words, "--help").out
+
+
 def test_options_without_effect_are_refused(run: Run) -> None:
     for words, name in ((["--same-object"], "--same-object"), (["--jobs", 1], "--jobs")):
         done = run("grasp", *words)
