@@ -234,6 +234,8 @@ def test_what_can_not_be_read_is_named(fused_log: Path, tmp_path: Path) -> None:
         replay(fused_log, "gone.safetensors")
     with pytest.raises(LogError, match="No such file"):
         replay(tmp_path / "gone.mcap")
+    with pytest.raises(ConfigError, match="the log must be a path, not 3"):
+        replay(3)  # type: ignore[arg-type]
 
 
 def test_auto_is_settled_as_a_run_would(fused_log: Path, quick: list[str], tmp_path: Path) -> None:

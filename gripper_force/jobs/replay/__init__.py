@@ -66,7 +66,7 @@ def replay_frames(
     Arguments and errors are those of `replay`. The columns are ``log``, ``object``, ``seq`` (0 for a cycle), ``t_ns``,
     ``measured_n`` (load cell), ``visual_n``, ``visual_std_n``, ``fused_n`` and ``current_n``; NaN where there is none.
     """
-    reader = LogReader(Path(path), recover=recover)
+    reader = LogReader(path, recover=recover)
     resolved = resolve_replay(changed_config(reader, checkpoint, overrides))
     series = EstimateSeries()
     agreement = feed(reader, resolved, series)
