@@ -57,7 +57,7 @@ def saved_figure(path: Path, title: str, height_in: float, width_in: float = 10.
         try:
             figure.savefig(path)
         except OSError as error:
-            raise DataError(f"can't write the figure {path}: {error}; check its folder") from error
+            raise DataError(f"can't write the figure {path}: {error.strerror}; check its folder") from error
 
 
 def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
