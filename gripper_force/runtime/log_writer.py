@@ -69,7 +69,7 @@ class LogWriter:
         except OSError as error:
             there = "it exists already, and a log is never overwritten; move it away, or set log.directory"
             is_there = isinstance(error, FileExistsError) and error.filename == str(path)
-            reason = there if is_there else error.strerror
+            reason = there if is_there else f"{error.strerror} ({error.filename}); name another folder"
             raise LogError(f"can't write the log {path}: {reason}") from error
         self._writer = Writer(self._file)
         try:
