@@ -247,7 +247,7 @@ def _sentence(root: type[Section], error: ValidationError, where: str, what: str
         hint = _suggestion(root, parts)
         more = f". {section.unknown_hint}" if section.unknown_hint else ""
         return f"unknown {what} key {key!r} (from {where}){hint}; known here: {', '.join(section.model_fields)}{more}"
-    reason = first["msg"].removeprefix("Value error, ")
+    reason = first["msg"].removeprefix("Value error, ").removesuffix(" for <class 'pathlib.Path'>")
     if not parts:
         return f"the {what} (from {where}) is inconsistent: {reason}"
     if first["type"] == "model_type":

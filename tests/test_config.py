@@ -99,6 +99,13 @@ def test_a_value_out_of_range_is_refused_with_its_key_and_itself(assignment: str
     assert ", got " in str(caught.value)
 
 
+def test_a_value_that_is_no_path_is_named_in_plain_words() -> None:
+    with pytest.raises(
+        ConfigError, match=r"'log\.directory' \(from --set\): Input is not a valid path, got 5"
+    ):
+        load_config(None, ["log.directory=5"])
+
+
 @pytest.mark.parametrize(
     ("assignment", "sentence"),
     [
