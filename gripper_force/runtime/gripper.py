@@ -72,8 +72,9 @@ def open_gripper(
             "clock=lockstep runs in the caller's thread; leave background out, or set clock=realtime"
         )
     background = not lockstep if background is None else background
-    if (port is None) != (port_lock is None):
-        raise ConfigError("a shared port needs port and port_lock; pass both to open_gripper")
+    is_shared = port is not None or port_lock is not None
+    if is_shared and not (hasattr(port, "writePort") and hasattr(port_lock, "acquire")):
+        raise ConfigError("a shared port needs port, an open PortHandler, and port_lock, a Lock; pass both")
     shared = None if port is None or port_lock is None else SharedPort(port, port_lock)
     path = None if log is None else as_path(log, "the log")
     loop = ControlLoop(settings, path, background=background, port=shared)

@@ -248,6 +248,14 @@ def test_port_without_lock_is_refused(shared: SharedBus) -> None:
         gf.open_gripper(port_lock=shared.lock)
 
 
+def test_what_is_no_port_or_no_lock_is_refused(shared: SharedBus) -> None:
+    with pytest.raises(ConfigError, match="needs port, an open PortHandler"):
+        gf.open_gripper(port="/dev/ttyUSB0", port_lock=shared.lock)
+    with pytest.raises(ConfigError, match="and port_lock, a Lock"):
+        gf.open_gripper(port=shared.handler, port_lock=True)  # type: ignore[arg-type]
+    assert shared.bus.packets == []
+
+
 @pytest.mark.parametrize("key", ["servo.port=virtual:rig", "servo.backend=mine"])
 def test_port_for_another_servo_is_refused(shared: SharedBus, key: str, quick: list[str]) -> None:
     overrides = [*quick, "servo.port=/dev/ttyUSB0", "load_cell.backend=none", "clock=realtime", key]
