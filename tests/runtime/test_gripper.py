@@ -259,6 +259,17 @@ def test_an_argument_of_another_type_is_a_configuration_error(
         gf.open_gripper(**arguments)
 
 
+@pytest.mark.parametrize("wait", [True, False])
+def test_a_program_may_decide_at_run_time_whether_it_waits(simulated: Open, wait: bool) -> None:
+    """The type of ``wait`` is bool here, which a type checker must accept, too."""
+    gripper = simulated()
+    first: gf.GraspResult | None = gripper.grasp(2.0, wait=wait)
+    while not gripper.state.outcome:
+        gripper.step()
+    second: gf.GraspResult | None = gripper.set_force(2.5, wait=wait)
+    assert [result is not None and result.held for result in (first, second)] == [wait, wait]
+
+
 def test_force_is_only_set_on_a_gripped_object(simulated: Open) -> None:
     with pytest.raises(gf.RequestError, match=r"no object is gripped .*call grasp first"):
         simulated().set_force(2.0)
