@@ -72,6 +72,11 @@ def simulate(
     from gripper_force.jobs import simulate as job
 
     plans: list[job.Plan]
+    chosen = [text for text in set_ or () if text.partition("=")[0] in ("object", "seed", "target_n")]
+    _refuse(
+        {f"--set {text}": text for text in chosen},
+        "can't be used: simulate chooses object, seed and target of each log; use --object or --first-seed",
+    )
     if protocol is None:
         _refuse(
             {"--scale": scale, "--instances": instances},

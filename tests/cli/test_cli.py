@@ -636,8 +636,8 @@ def test_an_interrupt_at_any_time_ends_a_command_and_its_processes(
     program = (
         "import sys; from gripper_force.cli import main; print('ready', file=sys.stderr, flush=True); main()"
     )
-    options = {"grasp": ("--trials", "400"), "simulate": ("--presses", "400")}
-    command = [sys.executable, "-c", program, name, "--json", *options[name], "--jobs", "2", *sets]
+    options = {"grasp": ("--trials", "400", *sets), "simulate": ("--presses", "400")}
+    command = [sys.executable, "-c", program, name, "--json", *options[name], "--jobs", "2"]
     with subprocess.Popen(
         command,
         cwd=tmp_path,
@@ -695,6 +695,7 @@ def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
         (["--protocol", "shin2019", "--presses", "9"], "--presses can't be combined"),
         (["--protocol", "shin2019", "--grasps", "0", "--first-seed", "7"], "--grasps and --first-seed can't"),
         (["--protocol", "shin2019", "--object", "tube"], "--object can't be combined"),
+        (["--set", "object=tube", "--set", "seed=1"], "--set object=tube and --set seed=1 can't be used"),
     ],
 )
 def test_what_a_simulation_would_not_heed_is_an_error(
