@@ -31,7 +31,8 @@ REJECTED: Final = 0.03
 MIN_LOGS: Final = 8
 """Fewer logs with contact do not show how logs differ."""
 
-_FOLDS: Final = 4
+FOLDS: Final = 4
+"""Parts of the logs, each scored by the subspace of the others. Each needs a set of its own."""
 
 
 class _Seen(NamedTuple):
@@ -50,7 +51,7 @@ def fit_ood(
     device: str = "cpu",
     progress: Progress = no_progress,
 ) -> OodModel | None:
-    """Fits the model with the logs in four parts: each part is scored by the subspace of the others.
+    """Fits the model with the sets in four parts: each part is scored by the subspace of the others.
 
     Args:
         networks: The members, in evaluation mode, on ``device``.
@@ -60,10 +61,11 @@ def fit_ood(
         progress: Called after each clip.
 
     Returns:
-        The model; None with fewer than `MIN_LOGS` logs that show contact.
+        The model; None if the logs that show contact are fewer than `MIN_LOGS`, or of fewer than `FOLDS` sets.
     """
     check_size(clips, header.preprocess)
     seen = []
+    sets: list[tuple[str, str]] = []  # of each log: object and set
     for clip in clips:
         forces_n, read_out = features(networks, header.preprocess, clip.frames, device)
         used = clip.labelled(header.preprocess.lead_in)
@@ -71,12 +73,16 @@ def fit_ood(
             std_n = claimed_std_n(header, forces_n[:, used])
             force_n = clip.forces_n[used].astype(np.float64)
             seen.append(_Seen(read_out[used], forces_n[:, used].mean(0).astype(np.float64), std_n, force_n))
+            sets.append((clip.object, clip.set))
         progress(f"scored {clip.name}")
-    if len(seen) < MIN_LOGS:
+    different = list(dict.fromkeys(sets))
+    if len(seen) < MIN_LOGS or len(different) < FOLDS:
         return None
-    fold = np.random.default_rng(0).permutation(len(seen)) % _FOLDS
+    # Logs of one set show the same touches: in two parts, one would be scored by the other.
+    part_of = dict(zip(different, np.random.default_rng(0).permutation(len(different)) % FOLDS, strict=True))
+    fold = np.array([part_of[one] for one in sets])
     shares: list[Floats] = [np.empty(0)] * len(seen)
-    for part in range(_FOLDS):
+    for part in range(FOLDS):
         subspace = _subspace([log for log, own in zip(seen, fold, strict=True) if own != part])
         for i in np.flatnonzero(fold == part):
             shares[i] = residual_share(seen[i].features, *subspace)
@@ -156,7 +162,7 @@ def calibrate_network(
         progress: Called twice for each log.
 
     Raises:
-        DataError: There are fewer than `MIN_LOGS` logs that show contact.
+        DataError: The logs that show contact are fewer than `MIN_LOGS`, or of fewer than `FOLDS` sets.
         LogError: A log can't be read.
         CheckpointError: The checkpoint can't be read or written.
     """
@@ -167,7 +173,8 @@ def calibrate_network(
     model = fit_ood(checkpoint.force_networks, checkpoint.header, clips, progress=progress)
     if model is None:
         raise DataError(
-            f"a score needs at least {MIN_LOGS} logs that show contact and were not trained on; simulate or record more"
+            f"a score needs at least {MIN_LOGS} logs that show contact and were not trained on, of at least {FOLDS} "
+            "sets; simulate or record more"
         )
     add_ood(source, model, out)
     return model

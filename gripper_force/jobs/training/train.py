@@ -20,7 +20,7 @@ from gripper_force.jobs.report.plots import draw_training
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.few import PROGRESS_STEPS as PROGRESS_STEPS
-from gripper_force.jobs.training.ood_fit import MIN_LOGS, add_ood, fit_ood
+from gripper_force.jobs.training.ood_fit import FOLDS, MIN_LOGS, add_ood, fit_ood
 from gripper_force.jobs.training.parallel import TrainingProcess, join_training_processes
 from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
@@ -182,8 +182,8 @@ def _add_ood(
         add_ood(out, ood, out)
     else:
         warn(
-            f"the checkpoint has no out-of-distribution score, which needs {MIN_LOGS} validation logs that show "
-            "contact; fit one with `gripper-force calibrate network`"
+            f"the checkpoint has no out-of-distribution score, which needs {MIN_LOGS} validation logs of {FOLDS} sets "
+            "that show contact; fit one with `gripper-force calibrate network`"
         )
 
 

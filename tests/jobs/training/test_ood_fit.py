@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.training import ood_fit
 from gripper_force.jobs.training.ood_fit import MIN_LOGS, add_ood, fit_ood
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -43,6 +44,27 @@ def test_score_of_known_logs_is_below_the_limit_and_the_digest_stays(
 def test_few_logs_give_no_score(tiny_checkpoint: Path, clips_of_32: list[Clip]) -> None:
     loaded = load_checkpoint(tiny_checkpoint)
     assert fit_ood(loaded.force_networks, loaded.header, clips_of_32[: MIN_LOGS - 1]) is None
+
+
+def test_logs_of_a_set_do_not_score_each_other(
+    tiny_checkpoint: Path, clips_of_32: list[Clip], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = load_checkpoint(tiny_checkpoint)
+
+    def like_no_other(_: object, __: object, frames: np.ndarray, ___: str) -> tuple[np.ndarray, np.ndarray]:
+        """Returns features in a direction that only logs with the same frames share."""
+        direction = np.random.default_rng(int(frames.sum())).normal(size=2000)
+        along = np.outer(np.arange(len(frames)), direction)
+        return np.ones((1, len(frames)), np.float32), along.astype(np.float32)
+
+    monkeypatch.setattr(ood_fit, "features", like_no_other)
+    once = [replace(clip, set=f"s{i}") for i, clip in enumerate(clips_of_32[:MIN_LOGS])]
+    again = [replace(clip, name=f"{clip.name} again") for clip in once]  # as under another light
+    model = fit_ood(loaded.force_networks, loaded.header, [*once, *again])
+    assert model is not None
+    assert all(limit.typical > 0.5 for limit in model.limits)
+    one_set = [replace(clip, set="all") for clip in clips_of_32]
+    assert fit_ood(loaded.force_networks, loaded.header, one_set) is None
 
 
 def test_command_says_how_many_logs_it_needs(few_logs: Path, tiny_checkpoint: Path, tmp_path: Path) -> None:
