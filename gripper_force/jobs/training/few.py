@@ -79,7 +79,8 @@ def fit(clips: Sequence[Clip], preprocess: Preprocess, progress: Progress = no_p
         DataError: There is only one set, or no frame shows contact.
     """
     key = "object" if len({clip.object for clip in clips}) > 2 else "set"
-    names = [getattr(clip, key) for clip in clips]
+    # Sets of two objects may have one name.
+    names = [clip.object if key == "object" else f"{clip.object}, {clip.set}" for clip in clips]
     if len(set(names)) < 2:
         raise DataError(
             f"the settings are chosen on recordings left out, but there is only one {key}; add logs"
@@ -104,7 +105,7 @@ def fit(clips: Sequence[Clip], preprocess: Preprocess, progress: Progress = no_p
                 [np.abs(f - clips[i].forces_n)[clips[i].valid] for i, f in zip(fold, forces_n, strict=True)]
             ).mean()
         done = [PROGRESS_STEPS * count // folds for count in (number, number + 1)]
-        progress(f"without {', '.join(sorted(held))}", done[1] - done[0])
+        progress(f"without {'; '.join(sorted(held))}", done[1] - done[0])
     best = int(errors_n.argmin())
     process = fitted(clips, preprocess, settings[best])
     return Fit(process, settings[best], [left_out[i][best] for i in range(len(clips))])

@@ -135,6 +135,11 @@ def test_settings_are_chosen_on_what_was_left_out(six: list[Clip]) -> None:
         few.fit(silent, preprocess)
 
 
+def test_sets_of_two_objects_may_have_one_name(six: list[Clip]) -> None:
+    two = [replace(clip, object=name, set="1") for clip, name in zip(six[:2], ("cup", "box"), strict=True)]
+    assert len(few.fit(two, recipe("few", ["preprocess.size=16"]).preprocess).forces_n) == 2
+
+
 def test_keys_of_networks_are_refused(six: list[Clip], process: Path, small_recipe: TrainConfig) -> None:
     with pytest.raises(ConfigError, match="a Gaussian process has no steps"):
         recipe("few", ["steps=5"])
