@@ -479,7 +479,6 @@ def _metadata(resolved: ResolvedConfig, devices: Devices) -> dict[str, str]:
     profile = {} if resolved.correction is None else {"profile": resolved.correction.profile.weights}
     return {
         "object": config.object,
-        "set": f"{config.object}-{config.seed}",
         "clock": config.clock,
         "checkpoint": resolved.model.digest if resolved.model else "",
         "choices": "\n".join(resolved.choices),

@@ -787,6 +787,7 @@ def test_versions_are_those_of_installed_packages() -> None:
     devices = SimpleNamespace(notes={"serial": "7"}, clock=None, lockstep=True)
     about = session_module._metadata(ResolvedConfig(Config()), devices)  # type: ignore[arg-type]
     assert about["serial"] == "7"
+    assert "set" not in about  # logs of real devices show one scene each, whatever the seed is
     assert about["checkpoint"] == ""
     assert about["version numpy"] == np.__version__
     assert "version openvino" not in about
