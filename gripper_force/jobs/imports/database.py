@@ -19,7 +19,7 @@ entries are counted, and the summary names the first of each kind.
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -33,6 +33,7 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.imports.imported_log import load_cell_samples, write_recording
 from gripper_force.jobs.paper_protocol import RATE_HZ, TOUCHES, split_of
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S, Frame, Gray
 from gripper_force.vision.preprocess import Region, downscale
 
@@ -122,7 +123,7 @@ def import_environment(
 ) -> EnvironmentSummary:
     """Imports one environment into logs ``<folder>-<set>.mcap``.
 
-    Existing logs are kept, so an interrupted import can be continued.
+    Existing logs with the same settings are kept, so an interrupted import can be continued.
 
     Args:
         folder: One of `find_environments`.
@@ -132,7 +133,8 @@ def import_environment(
         size: Side of the logged frames in pixels.
 
     Raises:
-        DataError: No line of its table is usable, or none of the images in its table exists.
+        DataError: No line of its table is usable, none of the images in its table exists, or an existing log was made
+            with another frame rate, region or size.
         ConfigError: The region is not within an image.
         LogError: A log can't be written.
     """
@@ -141,13 +143,14 @@ def import_environment(
     images = {int(path.stem): path for path in folder.glob("*.jpg") if _IMAGE.fullmatch(path.stem)}
     problems += _unmatched(folder, images, forces_n)
     sets = find_sets(np.array(list(forces_n)), np.array(list(forces_n.values())))
+    settings = {"rate_hz": f"{rate_hz:g}", "region": f"{region and list(region)}", "size_px": f"{size}"}
     metadata = {
         "object": object_name,
         "source": folder.name,
         "degrees": str(degrees),
         "illumination": illumination,
         "lux": str(LUX[illumination]),
-        "rate_hz": f"{rate_hz:g}",
+        **settings,
     }
     config = Config(object=object_name, camera=CameraConfig(rate_hz=rate_hz))
     numbers = np.array(sorted(images.keys() | forces_n.keys()))
@@ -159,6 +162,7 @@ def import_environment(
     for i, (part, (_, touches)) in enumerate(zip(parts, sets, strict=True), start=1):
         log = out / split_of(i) / f"{folder.name}-{i:02d}.mcap"
         if log.exists():
+            _check_same(log, settings)
             kept += 1
             continue
         t_ns = {int(n): round(int(n - part[0]) * NS_PER_S / rate_hz) for n in part}
@@ -192,6 +196,17 @@ def import_environment(
             *_problem("{} sets start in contact, and train and evaluate leave them out", loaded),
         ),
     )
+
+
+def _check_same(log: Path, settings: Mapping[str, str]) -> None:
+    """Raises `DataError` if an existing log was imported with other settings; one of version 0.1 names only the rate."""
+    made = LogReader(log).metadata
+    for key, value in settings.items():
+        if (old := made.get(key, value)) != value:
+            raise DataError(
+                f"{log} exists already and was imported with {key} {old}, not {value}; use another folder, or move that "
+                "log away"
+            )
 
 
 def _unmatched(folder: Path, images: dict[int, Path], forces_n: dict[int, float]) -> list[str]:

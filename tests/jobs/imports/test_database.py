@@ -135,14 +135,20 @@ def test_interrupted_import_continues(environment: Path, tmp_path: Path) -> None
     import_environment(environment, out)
     first, second = sorted((out / "train").iterdir())
     whole = second.read_bytes()
-    first.write_bytes(b"made before")
+    made_before = first.read_bytes()
     second.unlink()
     (out / f".{second.name}.part").write_bytes(b"half a log")
     row = import_environment(environment, out)
     assert (row.logs, row.kept, row.frames) == (2, 1, 80)
-    assert first.read_bytes() == b"made before"
+    assert first.read_bytes() == made_before
     assert second.read_bytes() == whole
     assert sorted((out / "train").iterdir()) == [first, second]
+    second.unlink()
+    with pytest.raises(DataError, match=r"imported with region None, not \[8, 0, 8, 8\]; use another folder"):
+        import_environment(environment, out, region=(8, 0, 8, 8))
+    with pytest.raises(DataError, match="imported with rate_hz 149, not 30"):
+        import_environment(environment, out, rate_hz=30)
+    assert not second.exists()
 
 
 # Sets.
