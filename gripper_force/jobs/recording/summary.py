@@ -255,7 +255,8 @@ def _warnings(overall: Totals) -> list[str]:
             "exposure, cable and camera.rate_hz"
         )
     if overall.frames_lost:
-        warnings.append(f"{overall.frames_lost} of {overall.frames} frames were lost")
+        total = overall.frames + overall.frames_lost
+        warnings.append(f"{overall.frames_lost} of {total} frames were lost")
     if overall.load_cell_hz < _SLOW_HZ:
         warnings.append(
             f"the load cell gave {overall.load_cell_hz:.0f} valid samples/s; below {_SLOW_HZ:g} the lag is "

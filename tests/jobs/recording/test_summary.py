@@ -102,7 +102,7 @@ def test_lost_frames_and_rejected_samples_are_counted(log: Path, tmp_path: Path)
     assert one.sets[0].frames_lost == whole.frames - one.sets[0].frames > 10
     assert two.sets[0].frames_lost == one.sets[0].frames_lost
     assert "frames/s instead of 30" in one.warnings[0]
-    assert "frames were lost" in one.warnings[1]
+    assert one.warnings[1] == f"{one.overall.frames_lost} of {whole.frames} frames were lost"
 
 
 def test_jitter_is_not_counted_as_loss() -> None:
