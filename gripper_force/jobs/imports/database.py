@@ -199,13 +199,13 @@ def import_environment(
 
 
 def _check_same(log: Path, settings: Mapping[str, str]) -> None:
-    """Raises `DataError` if an existing log was imported with other settings; one of version 0.1 names only the rate."""
+    """Raises `DataError` if an existing log was imported with other settings; version 0.1 wrote only the rate."""
     made = LogReader(log).metadata
     for key, value in settings.items():
         if (old := made.get(key, value)) != value:
             raise DataError(
-                f"{log} exists already and was imported with {key} {old}, not {value}; use another folder, or move that "
-                "log away"
+                f"{log} exists already and was imported with {key} {old}, not {value}; use another folder, or move "
+                "that log away"
             )
 
 
