@@ -129,8 +129,13 @@ def _focus(gray: Gray, region: Region | None) -> list[str]:
 
 def _markers(markers: Markers, region: Region | None, gray: Gray) -> list[str]:
     seen = " and ".join(str(number) for number in sorted(markers))
-    if len(markers) == len(MARKERS) and region is not None:
+    if len(markers) == len(MARKERS):
         remarks = ["markers: both seen"]
+        if region is None:
+            remarks = [
+                "markers: both seen, but one is more than twice as large as the other; print both in one size, for a "
+                "region around them"
+            ]
     elif markers:
         remarks = [
             f"markers: only {seen} is seen; bring both into view, lit and not hidden, for a region around them"
