@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gripper_force.config import Overrides, config_from_text
 from gripper_force.control.object_gain import GATE, REPEAT_STD, GainEstimate, ObjectGain
-from gripper_force.errors import DataError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.profiles.object_profile import BUNDLED, find_object, read_object, user_folder, weights_path
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import make_controller
@@ -77,7 +77,7 @@ def save_gain(
 
     Raises:
         DataError: No log has a grasp that was held with vision, or the logs contradict each other.
-        ConfigError: The profile or its second file can't be read, or the new one can't be written.
+        ConfigError: The profile or a file that belongs to it can't be read, or the new one can't be written.
         LogError: A log can't be read.
     """
     from gripper_force.jobs.profile_files import write_all, write_object
@@ -108,13 +108,25 @@ def save_gain(
         raise DataError(f"the gain is not saved: {gain.problem}")
     target = out or (source if source.name == BUNDLED else user_folder() / f"{source.stem}.yaml")
     changed = profile.model_copy(update={"ratio": total})
+    weights = _read_beside(source, weights_path(source))
     # The network of a bundle goes with its profile.
     if profile.network is not None and target.parent != source.parent:
         network = target.with_suffix(".network.safetensors")
-        write_all({network: (source.parent / profile.network).read_bytes()})
+        write_all({network: _read_beside(source, source.parent / profile.network)})
         changed = changed.model_copy(update={"network": network.name})
-    write_object(target, changed, weights_path(source).read_bytes())
+    write_object(target, changed, weights)
     return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
+
+
+def _read_beside(profile: Path, file: Path) -> bytes:
+    """Returns the content of a file that belongs to a profile."""
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"can't read {file}, which belongs to the object profile {profile}: {error.strerror}; copy all files of "
+            "the profile"
+        ) from error
 
 
 def _contradiction(pair: tuple[tuple[float, float], tuple[float, float]]) -> float:

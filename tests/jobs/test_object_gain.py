@@ -55,6 +55,11 @@ def test_the_network_of_a_bundle_goes_with_the_profile(
     assert (tmp_path / saved.network).read_bytes() == b"weights"
     assert save_gain(str(bundle.parent), [tmp_path]).profile == bundle
     assert read_object(bundle).network == "network.safetensors"
+    for missing in (bundle.with_name("network.safetensors"), weights_path(bundle)):
+        missing.unlink()
+        with pytest.raises(ConfigError, match=rf"can't read {missing}, which belongs to .*: No such file"):
+            save_gain(str(bundle.parent), [tmp_path], tmp_path / "other.yaml")
+    assert not list(tmp_path.glob("other*"))
 
 
 @pytest.mark.parametrize("uncertain", [[], [(0.5, 0.9)], [(2.0, 0.9), (0.5, 0.9)]])
