@@ -3,6 +3,7 @@ import json
 import math
 import re
 from html.parser import HTMLParser
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from mcap.stream_reader import breakup_chunk
 
 import gripper_force as gf
 from gripper_force.config import config_from, dump_config
-from gripper_force.errors import LogError
+from gripper_force.errors import LogError, NonFiniteError
 from gripper_force.jobs import report as report_module
 from gripper_force.jobs.report import pictures as pictures_module
 from gripper_force.jobs.report import reading as reading_module
@@ -46,6 +47,7 @@ from gripper_force.types import (
 )
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
+from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import Header, NetworkConfig, Residual
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
@@ -461,6 +463,21 @@ def test_a_frame_that_the_network_did_not_see_has_no_attention(grasp: Path) -> N
     attention = [kept.attention is not None for kept in sampler._kept]
     assert any(attention[:100])
     assert not any(attention[100:])
+
+
+def test_a_frame_whose_estimate_is_not_finite_has_no_attention(
+    grasp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = LogReader(grasp)
+    sampler = FrameSampler(log)
+
+    def diverge(_: object, __: object) -> None:
+        raise NonFiniteError("the network returned [nan] N")
+
+    monkeypatch.setattr(ForceEstimator, "update", diverge)
+    for frame in islice(log.records(Frame), 3):
+        sampler.add(frame)
+    assert [kept.attention for kept in sampler._kept] == [None] * 3
 
 
 def test_frames_of_recording_span_its_touch(tmp_path: Path) -> None:

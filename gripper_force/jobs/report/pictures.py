@@ -10,7 +10,7 @@ import numpy.typing as npt
 from matplotlib import colormaps
 
 from gripper_force.config import config_from_text
-from gripper_force.errors import CheckpointError, DataError, UnfamiliarFrameError
+from gripper_force.errors import CheckpointError, DataError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.jobs.report.run import Run
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import GRIPPING, NS_PER_S, Frame, Gray
@@ -123,7 +123,7 @@ class FrameSampler:
                 self._estimator.update(frame.gray)
             except UnfamiliarFrameError as error:
                 seen = math.isfinite(error.force_n)
-            except DataError:
+            except (DataError, NonFiniteError):
                 seen = False
             attention = self._estimator.attention_map() if seen else None
         if self._count % self._step == 0:
