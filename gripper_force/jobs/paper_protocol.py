@@ -125,7 +125,8 @@ class SetPlan:
     def check(self, out: Path, config: Tree) -> None:
         """Raises `DataError` if the existing logs were made with another configuration."""
         for lux, name in zip(self.lux, self.names, strict=True):
-            path = out / name
+            if not (path := out / name).exists():
+                continue
             seed = config_from_text(LogReader(path).config, str(path)).seed  # of the draw that succeeded
             drawn = _set_config(
                 config_from(config, "simulate"), self, seed, lux, np.random.default_rng([seed, 11])

@@ -132,11 +132,12 @@ def simulate(
     tree = config.model_dump(mode="json")
     missing, objects = [], dict[str, tuple[Path, str]]()
     for one in plans:
-        if all((out / name).exists() for name in one.names):
+        made = [path for name in one.names if (path := out / name).exists()]
+        if made:  # also if not all are: the others must fit to them
             one.check(out, tree)
-            for name in one.names:
-                check_object_file(out / name, objects)
-        else:
+        for path in made:
+            check_object_file(path, objects)
+        if len(made) < len(one.names):
             missing.append(one)
     with Workers(workers, ray).pool() as pool:
         futures = [pool.submit(p.make, out, tree) for p in missing]
