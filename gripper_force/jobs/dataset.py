@@ -210,6 +210,22 @@ def split_by(
     ]
 
 
+def label_mask(clips: Sequence[Clip], lead_in: int) -> npt.NDArray[np.bool_]:
+    """Returns the mask of the frames with a label after each clip's first ``lead_in``, over all clips, (N,).
+
+    Raises:
+        DataError: There is no such frame.
+    """
+    if not any(clip.valid.any() for clip in clips):
+        raise DataError("no frame has a label; use recordings with a load cell")
+    valid = np.concatenate([clip.labelled(lead_in) for clip in clips])
+    if not valid.any():
+        raise DataError(
+            f"no frame after a recording's first {lead_in} has a load-cell force; use longer recordings"
+        )
+    return valid
+
+
 def check_size(clips: Iterable[Clip], preprocess: "Preprocess") -> None:
     """Raises `DataError` if a clip's frames do not have the size of the networks' input."""
     for clip in clips:

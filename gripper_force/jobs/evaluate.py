@@ -18,6 +18,7 @@ from gripper_force.jobs.dataset import (
     Clip,
     StreamedClip,
     find_logs,
+    label_mask,
     starts_in_contact,
     stiffness_floor_n,
     without_contact_starts,
@@ -270,7 +271,7 @@ def errors_on(
     Raises:
         DataError: There are no clips or no labels.
     """
-    valid = _has_label(clips, lead_in)
+    valid = label_mask(clips, lead_in)
     measured_n, predicted_n, objects = _labelled(clips, forces_n, lead_in)
     floors_n = np.concatenate([stiffness_floor_n(clip.forces_n, clip.stiffness) for clip in clips])[valid]
     return Evaluation(
@@ -314,23 +315,11 @@ def _log_errors(clip: Clip, forces_n: npt.NDArray[np.floating], lead_in: int) ->
     return _object_errors(forces_n[valid], measured_n, stiffness_floor_n(measured_n, clip.stiffness))
 
 
-def _has_label(clips: Sequence[Clip], lead_in: int) -> npt.NDArray[np.bool_]:
-    """Returns the mask of the frames with a label after each clip's first ``lead_in``, (N,)."""
-    if not any(clip.valid.any() for clip in clips):
-        raise DataError("no frame has a label; use recordings with a load cell")
-    valid = np.concatenate([clip.labelled(lead_in) for clip in clips])
-    if not valid.any():
-        raise DataError(
-            f"no frame after a recording's first {lead_in} has a load-cell force; use longer recordings"
-        )
-    return valid
-
-
 def _labelled(
     clips: Sequence[Clip], forces_n: Sequence[npt.NDArray[np.floating]], lead_in: int
 ) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating], npt.NDArray[np.str_]]:
     """Returns measured and estimated force in N, and the object, of each frame with a label; all (N,)."""
-    valid = _has_label(clips, lead_in)
+    valid = label_mask(clips, lead_in)
     measured_n = np.concatenate([clip.forces_n for clip in clips])[valid]
     objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]
     return measured_n, np.concatenate(forces_n)[valid], objects

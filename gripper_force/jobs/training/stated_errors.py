@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.jobs import metrics
-from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.dataset import Clip, label_mask
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Member, load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
@@ -63,11 +63,13 @@ def labelled_estimates(
     """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label.
 
     The first frames of a clip are left out, for which a run gives no estimate.
+
+    Raises:
+        DataError: No frame has a label.
     """
-    used = [clip.labelled(preprocess.lead_in) for clip in clips]
-    pairs = list(zip(clips, used, strict=True))
-    forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[mask] for clip, mask in pairs]
-    return np.concatenate(forces_n), np.concatenate([clip.forces_n[mask] for clip, mask in pairs])
+    used = label_mask(clips, preprocess.lead_in)
+    forces_n = [predict(networks, preprocess, clip.frames, device).mean(0) for clip in clips]
+    return np.concatenate(forces_n)[used], np.concatenate([clip.forces_n for clip in clips])[used]
 
 
 def errors(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> dict[str, float]:

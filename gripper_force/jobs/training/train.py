@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs import metrics
-from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
+from gripper_force.jobs.dataset import Clip, check_size, digest, label_mask, split_by
 from gripper_force.jobs.report.plots import draw_training
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.batches import Batches, Replay
@@ -28,7 +28,6 @@ from gripper_force.jobs.training.stated_errors import errors, labelled_estimates
 from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
-from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.checkpoint_writer import check_place, save_checkpoint
 from gripper_force.vision.header import Header, read_checkpoint
@@ -83,8 +82,8 @@ def train(
         The checkpoint as written.
 
     Raises:
-        DataError: There is only one set, no frame shows contact, or a recording is too short or of another
-            size.
+        DataError: There is only one set, no frame shows contact, no validation frame has a label, or a recording is
+            too short or of another size.
         NonFiniteError: The training diverged.
         CheckpointError: A state belongs to another recipe or other data, or a file can't be written.
         ConfigError: The recipe sets a key in which ``init`` differs, ``init`` or ``replay_clips`` are given for
@@ -107,6 +106,9 @@ def train(
     if held_out is None:
         training, held_out = _split(config, clips)
     check_size([*training, *held_out, *replay_clips], config.preprocess)
+    label_mask(
+        held_out, config.preprocess.lead_in
+    )  # raises, before hours of work, if there is no error to state
     states = state_paths(config, out)
     with join_training_processes(config.device) as process:
         trainers = _trained(
@@ -196,15 +198,14 @@ def _fit(
 ) -> None:
     """Fits a Gaussian process and writes its checkpoint. Its stated error is that on objects left out."""
     check_size([*clips, *(validation_clips or [])], config.preprocess)
-    process, _, estimates_n = few.fit(clips, config.preprocess, progress)
-    held_out = clips
-    if validation_clips is not None:
-        held_out = validation_clips
-        estimates_n = [predict([process], config.preprocess, clip.frames)[0] for clip in held_out]
-    forces_n = np.concatenate(
-        [clip_n[clip.valid] for clip_n, clip in zip(estimates_n, held_out, strict=True)]
-    )
-    _save(out, [process], config, clips, forces_n, _labels_n(held_out), float(_labels_n(clips).mean()))
+    process, _, left_out_n = few.fit(clips, config.preprocess, progress)
+    if validation_clips is None:
+        used = label_mask(clips, config.preprocess.lead_in)
+        forces_n = np.concatenate(left_out_n)[used]
+        measured_n = np.concatenate([clip.forces_n for clip in clips])[used]
+    else:
+        forces_n, measured_n = labelled_estimates(validation_clips, [process], config.preprocess, "cpu")
+    _save(out, [process], config, clips, forces_n, measured_n, float(_labels_n(clips).mean()))
 
 
 def _labels_n(clips: Sequence[Clip]) -> npt.NDArray[np.float32]:

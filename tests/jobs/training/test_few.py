@@ -135,6 +135,15 @@ def test_settings_are_chosen_on_what_was_left_out(six: list[Clip]) -> None:
         few.fit(silent, preprocess)
 
 
+def test_stated_error_leaves_out_frames_without_an_estimate_in_a_run(six: list[Clip], process: Path) -> None:
+    header = load_checkpoint(process).header
+    lead_in = header.preprocess.lead_in
+    assert lead_in > 0
+    left_out_n = few.fit(six, header.preprocess).forces_n
+    error_n = [one[lead_in:] - clip.forces_n[lead_in:] for one, clip in zip(left_out_n, six, strict=True)]
+    assert header.metrics["mae_n"] == pytest.approx(np.abs(np.concatenate(error_n)).mean(), rel=1e-4)
+
+
 def test_sets_of_two_objects_may_have_one_name(six: list[Clip]) -> None:
     two = [replace(clip, object=name, set="1") for clip, name in zip(six[:2], ("cup", "box"), strict=True)]
     assert len(few.fit(two, recipe("few", ["preprocess.size=16"]).preprocess).forces_n) == 2

@@ -16,7 +16,7 @@ from gripper_force.errors import CheckpointError, ConfigError, DataError, NonFin
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, digest, load_clips
 from gripper_force.jobs.training import train as train_module
-from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.jobs.training.recipe import TrainConfig, recipe
 from gripper_force.jobs.training.train import train
 from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.vision.batch_inference import predict
@@ -85,6 +85,21 @@ def test_the_stated_error_is_that_on_the_validation_clips(
             clips[-1:],
             out,
             validation_clips=clips[-1:],
+        )
+
+
+@pytest.mark.parametrize("method", ["network", "process"])
+def test_validation_clips_without_a_label_are_refused(
+    method: str, clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
+    few = recipe("few", ["preprocess.size=16"])
+    first_only = replace(clips[-1], valid=np.arange(len(clips[-1].valid)) < 1)  # no run estimates this frame
+    with pytest.raises(DataError, match=r"no frame after a recording's first \d has a load-cell force"):
+        train(
+            small_recipe if method == "network" else few,
+            clips[:-1],
+            tmp_path / "out.safetensors",
+            validation_clips=[first_only],
         )
 
 
