@@ -266,13 +266,18 @@ class _ProcessPool(Executor):
             signal.SIG_BLOCK, _TERMINAL_SIGNALS
         )  # of this thread, inherited by the process
         context = get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, allowed_options()))
-        with self._lock:
-            if self._is_closed:
-                raise EOFError
-            process.start()
-            self._processes.append(process)
+        try:
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_serve, args=(theirs, allowed_options()))
+            with self._lock:
+                if self._is_closed:
+                    raise EOFError
+                process.start()
+                self._processes.append(process)
+        except OSError as error:  # too many processes or files
+            raise GripperError(
+                f"a worker process can't be started: {error.strerror}; use fewer --jobs"
+            ) from error
         theirs.close()
         return process, ours
 

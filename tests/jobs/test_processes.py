@@ -1,3 +1,4 @@
+import errno
 import gc
 import os
 import signal
@@ -8,6 +9,7 @@ import time
 from concurrent.futures import Future
 from multiprocessing import active_children
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import pytest
@@ -95,6 +97,20 @@ def send_half_a_result_and_die() -> None:
 
 def large_result() -> bytes:
     return bytes(1 << 28)
+
+
+def test_a_process_that_cannot_start_is_an_error_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    with process_pool(1) as pool:
+        with monkeypatch.context() as full:
+            full.setattr(SpawnProcess, "start", refuse)
+            with pytest.raises(
+                GripperError, match=r"can't be started: Resource temporarily unavailable; use fewer"
+            ):
+                pool.submit(abs, -1).result()
+        assert pool.submit(abs, -1).result() == 1
 
 
 def test_an_interruption_while_results_are_sent_ends_at_once() -> None:
