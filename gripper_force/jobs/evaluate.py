@@ -102,6 +102,7 @@ def evaluate(
     """Compares a checkpoint's estimates with the load cell, over logs that training has not seen.
 
     Every frame gets the network's estimate, corrected as in a run; also the frames that a run would reject.
+    A log that can't be read, or has no frames or no labels, does not stop the others; see `Evaluation.failed`.
 
     Example:
         >>> result = evaluate("data/test", "small")  # doctest: +SKIP
@@ -127,8 +128,6 @@ def evaluate(
 
     Returns:
         The errors over all frames with a load-cell force, by object, and by measured force.
-
-    A log that can't be read, or has no frames or no labels, does not stop the others; see `Evaluation.failed`.
 
     Raises:
         DataError: There are no logs, none of these objects, or all start in contact.
