@@ -269,7 +269,9 @@ def _press(row: int, index: int, folder: Path, tree: Tree) -> Tree:
     if not path.exists():
         make_log(log, logs, pressed.model_dump(mode="json"))
     checkpoint = load_checkpoint(config.vision.checkpoint)
-    version = hashlib.sha256(checkpoint.header.model_dump_json().encode()).hexdigest()
+    # All that `judge` takes, besides the region, which is part of the key.
+    judging = f"{checkpoint.header.model_dump_json()} {config.vision.max_covered}"
+    version = hashlib.sha256(judging.encode()).hexdigest()
     name = "-".join([spec.group, spec.name, scene, log.name, key, version[:12]]).replace(" ", "_")
     kept = folder / "judged" / f"{name}.json"
     if kept.exists():
