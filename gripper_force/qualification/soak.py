@@ -90,14 +90,14 @@ def soak(config: Config, simulated_s: float, progress: Progress = no_progress) -
 
     Args:
         config: Configuration; object, target, seed and log folder are replaced, and the logs deleted.
-        simulated_s: Simulated duration; at least the warm-up and two more grasps are run.
+        simulated_s: Simulated duration; at least the warm-up and two rounds of all objects are run.
         progress: Called after each grasp; a step is a simulated second.
     """
     begin_s = time.monotonic()
     rng = np.random.default_rng([config.seed, 30])
     samples = [_sample(0.0)]
     outcomes: Counter[str] = Counter()
-    done_s, fewest = 0.0, WARM_UP + 3
+    done_s, fewest = 0.0, WARM_UP + 2 * len(PAPER_OBJECTS)  # the first and the last round are compared
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
         quiet = config.with_values(log={"directory": Path(folder), "report": False})
         while done_s < simulated_s or len(samples) < fewest:
