@@ -18,6 +18,7 @@ from typing import Final, NamedTuple, TypedDict
 
 import numpy as np
 
+from gripper_force import __version__
 from gripper_force.config import Config, ControlConfig
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import GraspController
@@ -33,6 +34,7 @@ from gripper_force.qualification.loop_margin.analytic_plant import (
     SimulatedVision,
     transmission_of,
 )
+from gripper_force.qualification.result_lines import whole_lines
 from gripper_force.qualification.safety_statements import FORCE_SHARE, SPEED_SHARE, SafetyStatements
 from gripper_force.types import NS_PER_S, Outcome, Request, RequestKind, ServoCommand, ServoState
 
@@ -489,17 +491,16 @@ def search(
         progress: Called after each case.
 
     Raises:
-        DataError: The file can't be read or written, or is of another configuration or seed.
+        DataError: The file can't be read or written, or is of another configuration, seed or version.
     """
     results = _read(keep, config) if resume else {}
     missing = [index for index in range(cases) if index not in results]
     progress("", min(len(results), cases))
     try:
         keep.parent.mkdir(parents=True, exist_ok=True)
-        with keep.open("w", encoding="utf-8") as file:
-            file.write(json.dumps(_identity(config)) + "\n")
-            for result in results.values():
-                file.write(json.dumps(asdict(result)) + "\n")
+        with keep.open("a" if results else "w", encoding="utf-8") as file:
+            if not results:
+                file.write(json.dumps(_identity(config)) + "\n")
             with process_pool(workers) as pool:
                 run = partial(run_case, config, config.seed)
                 for result in pool.map(run, missing, chunksize=_CHUNK):
@@ -516,21 +517,20 @@ def _identity(config: Config) -> dict[str, object]:
     sections = {
         name: getattr(config, name).model_dump(mode="json") for name in ("control", "gripper", "servo")
     }
-    return {"seed": config.seed, **sections}
+    return {"version": __version__, "seed": config.seed, **sections}
 
 
 def _read(keep: Path, config: Config) -> dict[int, CaseResult]:
     if not keep.exists():
         return {}
     try:
-        first, *lines = keep.read_text(encoding="utf-8").splitlines()
+        first, *lines = whole_lines(keep)
         identity = json.loads(first)
-        complete = [line for line in lines if line.endswith("}")]  # the last may be cut
-        results = [CaseResult(**json.loads(line)) for line in complete]
+        results = [CaseResult(**json.loads(line)) for line in lines]
     except (OSError, ValueError, TypeError) as error:
         raise DataError(f"can't read {keep} ({error}); start again without --resume") from error
     if identity != _identity(config):
-        raise DataError(f"{keep} is of another configuration or seed; start again without --resume")
+        raise DataError(f"{keep} is of another configuration, seed or version; start again without --resume")
     return {result.index: result for result in results}
 
 

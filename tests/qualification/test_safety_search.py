@@ -175,8 +175,11 @@ def test_search_continues_where_it_was_interrupted(
     assert counts[0] == 3
     assert sum(counts) == 6
     other = config.with_values(seed=1)
-    with pytest.raises(DataError, match="another configuration or seed"):
+    with pytest.raises(DataError, match="another configuration, seed or version"):
         search(other, 6, 1, keep, resume=True)
+    monkeypatch.setattr(safety_search, "__version__", "0.0.1")
+    with pytest.raises(DataError, match="another configuration, seed or version"):
+        search(config, 6, 1, keep, resume=True)
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
 from gripper_force.jobs.trials import TrialsSummary, summarise_trials, trials, with_same_object
 from gripper_force.progress import Progress, no_progress
+from gripper_force.qualification.result_lines import whole_lines
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.gaussian_process import GaussianProcess
 from gripper_force.vision.model_files import read_model
@@ -277,12 +278,7 @@ def _scratch(config: Config, name: str, touched: Sequence[Path], out: Path) -> C
 
 
 def _rows(file: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a file of results. A last line that an interruption cut is removed from it."""
-    text = file.read_text() if file.exists() else ""
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        file.write_text(whole)
-    return [json.loads(line) for line in whole.splitlines()]
+    return [json.loads(line) for line in whole_lines(file)]
 
 
 def _digest(text: str) -> str:

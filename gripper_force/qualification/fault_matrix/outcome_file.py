@@ -10,6 +10,7 @@ from gripper_force import __version__
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError
 from gripper_force.progress import Progress
+from gripper_force.qualification.result_lines import whole_lines
 
 T = TypeVar("T")
 
@@ -35,7 +36,7 @@ class OutcomeFile(Generic[T]):
         outcomes: Outcomes so far.
 
     Raises:
-        DataError: The file can't be read or written, or was made with another configuration.
+        DataError: The file can't be read or written, or was made with another configuration or version.
     """
 
     def __init__(self, path: Path, config: Config, *, resume: bool) -> None:
@@ -46,11 +47,11 @@ class OutcomeFile(Generic[T]):
             path.parent.mkdir(parents=True, exist_ok=True)
             if not (resume and path.exists()):
                 path.write_text("", encoding="utf-8")
-            for line in path.read_text(encoding="utf-8").splitlines():
+            for line in whole_lines(path):
                 digest, key, outcome = json.loads(line)
                 self.outcomes[key] = outcome
                 if digest != self._digest:
-                    raise DataError(f"{path} was made with another configuration; run without --resume")
+                    raise DataError(f"{path} was made with another configuration or version; run without --resume")
         except (OSError, ValueError, TypeError) as error:
             raise DataError(f"can't continue with {path}: {error}; run without --resume") from error
 

@@ -20,11 +20,22 @@ def test_outcomes_are_read_back_only_to_resume(tmp_path: Path) -> None:
 def test_outcomes_of_another_configuration_raise(tmp_path: Path) -> None:
     path = tmp_path / "outcomes.jsonl"
     OutcomeFile[int](path, CONFIG, resume=False).add("a", 1)
-    with pytest.raises(DataError, match="with another configuration; run without --resume"):
+    with pytest.raises(DataError, match="with another configuration or version; run without --resume"):
         OutcomeFile[int](path, CONFIG.with_values(seed=6), resume=True)
 
 
-@pytest.mark.parametrize("damage", ["{", "[1, 2]", "7"])
+def test_a_last_line_that_an_interruption_cut_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "outcomes.jsonl"
+    OutcomeFile[int](path, CONFIG, resume=False).add("a", 1)
+    line = path.read_text()
+    path.write_text(line + line[:40])
+    again = OutcomeFile[int](path, CONFIG, resume=True)
+    assert again.outcomes == {"a": 1}
+    again.add("b", 2)
+    assert OutcomeFile[int](path, CONFIG, resume=True).outcomes == {"a": 1, "b": 2}
+
+
+@pytest.mark.parametrize("damage", ["{\n", "[1, 2]\n", "7\n"])
 def test_damaged_outcomes_raise(damage: str, tmp_path: Path) -> None:
     path = tmp_path / "outcomes.jsonl"
     path.write_text(damage)
