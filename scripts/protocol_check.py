@@ -7,6 +7,7 @@ with the penalty that is best there: the printed error is a lower bound.
     python scripts/protocol_check.py data/paper
 """
 
+import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -118,7 +119,12 @@ def components(images: Pixels) -> tuple[Array, Array]:
 
 def main() -> None:
     """Prints the table."""
-    train, test = (load(Path(sys.argv[1]) / split) for split in ("train", "test"))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path)
+    data = parser.parse_args().data
+    train, test = (load(data / split) for split in ("train", "test"))
 
     def position(samples: Samples) -> Array:
         return samples.position_rad[:, :1]

@@ -36,10 +36,10 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip, load_clips, without_contact_starts
 from gripper_force.jobs.estimates import estimate_clips
 from gripper_force.jobs.evaluate import errors_on
-from gripper_force.jobs.imports.video import find_recordings, import_video
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import TrainConfig, recipe
 from gripper_force.jobs.training.train import train
+from gripper_force.qualification.bench.teach_bench import digest_of_recordings, import_missing
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.gaussian_process import GaussianProcess
 
@@ -211,7 +211,7 @@ def main() -> None:
     torch.set_num_threads(1)
     clips = _read(options.recordings, options.out, options.jobs)
     if options.test:
-        test = _read(options.test, options.out / "test", options.jobs)
+        test = _read(options.test, options.out, options.jobs)
         seen = {clip.object for clip in clips}
         parts = {"all others": (clips, [clip for clip in test if clip.object not in seen])}
     else:
@@ -227,9 +227,9 @@ def main() -> None:
     results = json.loads(path.read_text()) if path.exists() else {}
     done = {}
     for name, (training, test) in track(parts.items(), "left out", console=Console(stderr=True)):
-        key = (
-            f"{options.recordings.resolve()}, {options.test or options.by}, {name}, network {options.minutes}"
-        )
+        # With other recordings, such as one more, the result is another one.
+        used = f"{digest_of_recordings(training)}, {digest_of_recordings(test)}"
+        key = f"{name}, network {options.minutes}, {used}"
         if key not in results:
             results[key] = run(training, test, options.minutes, options.out)
             path.write_text(json.dumps(results, indent=1))
@@ -249,12 +249,7 @@ def main() -> None:
 
 
 def _read(folder: Path, out: Path, workers: int) -> list[Clip]:
-    paths = []
-    for name, video, forces in find_recordings(folder):
-        paths.append(out / f"{name}.mcap")
-        if not paths[-1].exists():
-            import_video(video, forces, paths[-1], name=name)
-    clips = load_clips(paths, PREPROCESS, workers=workers)
+    clips = load_clips(import_missing(folder, out), PREPROCESS, workers=workers)
     used = without_contact_starts(clips, PREPROCESS)
     print(f"{folder}: {len(used)} of {len(clips)} recordings are used; the others start in contact")
     return used

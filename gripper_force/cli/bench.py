@@ -231,8 +231,8 @@ def teach(
                 progress("")
         text = job.markdown(rows)
     if write is not None:
-        write_between(write, "teach recordings" if real else "teach", text)
-    shown = {"recordings": [row._asdict() for row in real]} if real else {"cells": rows}
+        write_between(write, "teach" if recordings is None else "teach recordings", text)
+    shown = {"cells": rows} if recordings is None else {"recordings": [row._asdict() for row in real]}
     _show(shown, as_json, lambda: console.out.print(text, soft_wrap=True))
 
 

@@ -1,7 +1,7 @@
+import itertools
 import json
 import threading
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,7 @@ def test_interrupt_returns_the_results_so_far(grasps: int, monkeypatch: pytest.M
 
 
 def test_growth_of_memory_is_found_in_the_shortest_test(monkeypatch: pytest.MonkeyPatch) -> None:
-    memory_mb = count(300.0, 40.0)
+    memory_mb = itertools.count(300.0, 40.0)
 
     def grow(config: Config) -> dict[str, Any]:
         with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:

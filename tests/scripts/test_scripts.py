@@ -8,7 +8,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+
+from gripper_force.jobs.dataset import Clip
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
@@ -39,15 +42,48 @@ def test_a_loss_is_reported_although_friction_holds_the_jaws_and_the_view_seems_
     assert re.fullmatch(r"\| fused \| 1 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])
 
 
-@pytest.fixture
-def calibration_check() -> Any:
-    """The script as a module."""
-    spec = importlib.util.spec_from_file_location("calibration_check", SCRIPTS / "calibration_check.py")
+def test_protocol_check_without_a_folder_says_what_is_missing() -> None:
+    done = run("protocol_check.py")
+    assert done.returncode == 2
+    assert done.stderr.endswith("the following arguments are required: data\n")
+
+
+def module_of(name: str) -> Any:
+    """Returns a script as a module."""
+    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_real_grasps_does_not_use_results_of_other_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script, fitted = module_of("real_grasps"), list[int]()
+
+    def recording(number: int) -> Clip:
+        frames, forces_n = np.full((3, 4, 4), number, np.uint8), np.zeros(3, np.float32)
+        return Clip(frames, forces_n, np.ones(3, bool), str(number), f"o{number % 2}", str(number))
+
+    def run(training: list[Clip], test: list[Clip], *_: object) -> dict[str, Any]:
+        fitted.append(len(training))
+        return {"setting": {}, "errors": {"process": {test[0].object: [0.1, 0.2]}}}
+
+    monkeypatch.setattr(script, "run", run)
+    monkeypatch.setattr(sys, "argv", ["real_grasps.py", str(tmp_path), "--out", str(tmp_path)])
+    for count in (4, 4, 6):
+        clips = [recording(number) for number in range(count)]
+        monkeypatch.setattr(script, "_read", lambda *_, clips=clips: clips)
+        script.main()
+    assert fitted == [2, 2, 3, 3]
+
+
+@pytest.fixture
+def calibration_check() -> Any:
+    """The script as a module."""
+    return module_of("calibration_check")
 
 
 def test_results_of_another_network_are_not_used(

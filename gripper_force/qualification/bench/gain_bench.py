@@ -103,6 +103,7 @@ def bench(
         logs = []
         for place in range(presses):
             logs.append(folder / f"press-{name}-{seed + _PRESS_SEEDS + place}.mcap")
+            logs[-1].unlink(missing_ok=True)  # of an earlier run of this bench; a log is never overwritten
             _press(one.with_values(seed=seed + _PRESS_SEEDS + place), logs[-1], rng)
             progress(f"{name}, seed {seed}: press {place + 1}")
         yield _row(one, results, ratio, logs)

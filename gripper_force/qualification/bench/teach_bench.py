@@ -7,6 +7,7 @@ finished cell is one line of a file, and is not repeated with the same settings 
 
 import hashlib
 import json
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -250,6 +251,9 @@ def _learned(
     if cell.method != "taught":
         return config, ""
     bundle = place / f"bundle-{cell.touches}"
+    shutil.rmtree(
+        out, ignore_errors=True
+    )  # `teach` continues what is there, and the time would be that of the rest
     taught = teach(config, cell.object, logs=touched, folder=out, out=bundle, workers=workers)
     config = config.with_values(
         calibration={"object": str((taught.bundle / "profile.yaml").absolute())},
@@ -352,17 +356,11 @@ def bench_recordings(
     Raises:
         DataError: The recordings can't be used.
     """
-    # Another folder may have recordings of the same names.
-    logs = folder / f"recordings-{_digest(str(recordings.resolve()))[:8]}"
-    paths = []
-    for name, video, forces in find_recordings(recordings):
-        paths.append(logs / f"{name}.mcap")
-        if not paths[-1].exists():
-            progress(f"importing {name}")
-            import_video(video, forces, paths[-1], name=name)
     preprocess = recipe("few").preprocess
-    clips = without_contact_starts(load_clips(paths, preprocess), preprocess)
-    key = _digest(f"{digest(clips)} {[clip.object for clip in clips]}")
+    clips = without_contact_starts(
+        load_clips(import_missing(recordings, folder, progress), preprocess), preprocess
+    )
+    key = digest_of_recordings(clips)
     file = folder / "recordings.jsonl"
     rows = [RecordingRow(**row) for row in _rows(file)]
     for name in sorted({clip.object for clip in clips}):
@@ -379,6 +377,29 @@ def bench_recordings(
             with file.open("a") as out:
                 out.writelines(json.dumps(row._asdict()) + "\n" for row in found)
         yield from found
+
+
+def import_missing(recordings: Path, folder: Path, progress: Progress = no_progress) -> list[Path]:
+    """Imports the recordings that have no log yet, and returns the logs of all.
+
+    Args:
+        recordings: Folder as for `import video`.
+        folder: Folder of the logs, in which each folder of recordings has its own: two may have the same names.
+        progress: Called before each import.
+    """
+    logs = folder / f"recordings-{_digest(str(recordings.resolve()))[:8]}"
+    paths = []
+    for name, video, forces in find_recordings(recordings):
+        paths.append(logs / f"{name}.mcap")
+        if not paths[-1].exists():
+            progress(f"importing {name}")
+            import_video(video, forces, paths[-1], name=name)
+    return paths
+
+
+def digest_of_recordings(clips: Sequence[Clip]) -> str:
+    """Returns the digest of all frames, forces and objects."""
+    return _digest(f"{digest(clips)} {[clip.object for clip in clips]}")
 
 
 def _recording_row(

@@ -51,7 +51,9 @@ class OutcomeFile(Generic[T]):
                 digest, key, outcome = json.loads(line)
                 self.outcomes[key] = outcome
                 if digest != self._digest:
-                    raise DataError(f"{path} was made with another configuration or version; run without --resume")
+                    raise DataError(
+                        f"{path} was made with another configuration or version; run without --resume"
+                    )
         except (OSError, ValueError, TypeError) as error:
             raise DataError(f"can't continue with {path}: {error}; run without --resume") from error
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from gripper_force.cli import app
 from gripper_force.config import load_config
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench import teach_bench as job
 from gripper_force.qualification.bench.teach_bench import Cell, bench, foreign_rigs, list_cells, markdown
@@ -69,6 +69,25 @@ def test_a_cell_of_other_settings_or_of_an_earlier_version_is_measured_again(
     assert cell(4, "control.force_limit_n=5").settings != first.settings
     assert len(file.read_text().splitlines()) == 4
     assert cell(4) == first
+
+
+def test_the_time_of_teaching_is_that_of_the_whole_work(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[list[Path]] = []
+
+    def teach(*_: object, folder: Path, **__: object) -> None:
+        found.append(list(folder.rglob("*")))
+        (folder / "teach").mkdir(parents=True)
+        (folder / "teach" / "candidate").touch()
+        raise DataError("too few touches")
+
+    monkeypatch.setattr(job, "record_touches", lambda *_, **__: ())
+    monkeypatch.setattr(job, "teach", teach)
+    rigs = foreign_rigs(load_config(None, [f"vision.checkpoint={tiny_checkpoint}"]), 1)
+    for grasps in (0, 6):  # measured again with more grasps
+        list(bench(list_cells(rigs, ["peg"], [16], ["taught"]), grasps=grasps, folder=tmp_path))
+    assert found == [[], []]
 
 
 def test_table_has_medians_and_the_worst_of_what_was_measured() -> None:
@@ -134,6 +153,31 @@ def test_real_recordings_are_left_out_by_object_and_taught_in_order(recordings: 
     fewer = measured(recordings, tmp_path)
     assert [row["tested"] for row in fewer] == [2, 1, 2, 1, 1]
     assert {row["recordings"] for row in fewer}.isdisjoint({row["recordings"] for row in rows})
+
+
+def test_recordings_of_which_none_can_be_left_out_do_not_replace_the_table_of_rigs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job, "bench_recordings", lambda *_: iter(()))
+    page = tmp_path / "page.md"
+    page.write_text(
+        "".join(f"<!-- {name} -->\nold\n<!-- end of {name} -->\n" for name in ("teach", "teach recordings"))
+    )
+    call = [
+        "bench",
+        "teach",
+        "--recordings",
+        str(tmp_path),
+        "--out",
+        str(tmp_path),
+        "--write",
+        str(page),
+        "--json",
+    ]
+    result = CliRunner().invoke(app, call, catch_exceptions=False)
+    assert json.loads(result.stdout)["recordings"] == []
+    assert page.read_text().count("old") == 1
+    assert "<!-- teach -->\nold\n" in page.read_text()
 
 
 def test_unknown_method_is_named() -> None:
