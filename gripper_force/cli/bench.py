@@ -35,6 +35,8 @@ from gripper_force.errors import ConfigError
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
+    from gripper_force.jobs.dataset import Clip
+    from gripper_force.vision.preprocess import Preprocess
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed, memory and error on this machine.")
 
@@ -70,7 +72,6 @@ def estimator(
     """
     from tempfile import TemporaryDirectory
 
-    from gripper_force.jobs.dataset import load_clips
     from gripper_force.qualification.bench import estimator_bench
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.vision.header import SHIPPED
@@ -93,8 +94,8 @@ def estimator(
         with console.bar_or_lines("measuring", estimator_bench.count_steps(sources, counts)) as measured:
             rows = estimator_bench.bench(
                 sources,
-                lambda model: load_clips(data, model.header.preprocess, workers=jobs),
-                lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs),
+                lambda model: _load(data, jobs, model.header.preprocess),
+                lambda model: _load(scale_on, jobs, model.header.preprocess),
                 counts,
                 measured,
             )
@@ -107,6 +108,13 @@ def estimator(
     ratios = estimator_bench.ratios(rows)
     result = {"estimator": rows, "ratios": ratios, "plot": plot, "file": file}
     _show(result, as_json, lambda: estimator_table(rows, ratios, plot, file))
+
+
+def _load(data: Path, workers: int, preprocess: "Preprocess") -> "list[Clip]":
+    """Loads the logs of a folder that do not start in contact, as `train` and `evaluate` do."""
+    from gripper_force.jobs.dataset import load_clips, without_contact_starts
+
+    return without_contact_starts(load_clips(data, preprocess, workers=workers), preprocess)
 
 
 def _simulate_presses(folder: Path, settings: "Config", workers: int) -> tuple[Path, Path]:
@@ -404,11 +412,10 @@ def training(
     """Measure the validation error of several training recipes against training time."""
     from functools import partial
 
-    from gripper_force.jobs.dataset import load_clips
     from gripper_force.qualification.bench import training_bench
 
     points: list[training_bench.Point] = []
-    load = partial(load_clips, data, workers=jobs)
+    load = partial(_load, data, jobs)
     with console.bar("training", training_bench.TURNS) as progress:
         for point in training_bench.learn(load, minutes, set_ or [], folder, progress):
             points.append(point)
@@ -432,15 +439,12 @@ def checkpoints(
     as_json: AsJson = False,
 ) -> None:
     """Measure the errors of checkpoints on the same logs, so that `vision.checkpoint=auto` can compare them."""
-    from collections.abc import Sequence
-
-    from gripper_force.jobs.dataset import Clip, find_logs, load_clips, without_contact_starts
+    from gripper_force.jobs.dataset import find_logs, load_clips, without_contact_starts
     from gripper_force.jobs.training.stated_errors import state_errors
-    from gripper_force.vision.preprocess import Preprocess
 
     logs = find_logs(data)
 
-    def read(preprocess: Preprocess) -> Sequence[Clip]:
+    def read(preprocess: "Preprocess") -> "list[Clip]":
         with console.bar("reading logs", len(logs)) as progress:
             return without_contact_starts(
                 load_clips(logs, preprocess, workers=jobs, progress=progress), preprocess

@@ -73,7 +73,7 @@ class BusCost:
         line_ms: Time of the line alone: transmission of the bytes, and the latency.
         p50_ms: Median time of a cycle, back to back with the next.
         p99_ms: 99th percentile of that time.
-        cpu_share: Share of one CPU that the client uses at 200 cycles per second.
+        cpu_share: Share of one CPU that the client's thread uses at 200 cycles per second, without that of the arm.
     """
 
     client: str

@@ -194,7 +194,7 @@ def loop(
             file then, because a window's cost depends on the graphics. Foxglove has a client that shows nothing.
 
     Raises:
-        GripperError: The virtual servo did not answer, or the configuration is wrong.
+        GripperError: The virtual servo did not start, or the configuration is wrong.
     """
     loops = {"vision": _Measured(), "nothing": _Measured()}
     if viewer is not None:
@@ -290,7 +290,11 @@ def _virtual_servo() -> Iterator[str]:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         try:
             assert process.stdout is not None
-            yield json.loads(process.stdout.readline())["port"]
+            if not (line := process.stdout.readline()):
+                raise GripperError(
+                    "the virtual servo did not start; run gripper-force virtual-servo, which says why"
+                )
+            yield json.loads(line)["port"]
         finally:
             process.terminate()
 

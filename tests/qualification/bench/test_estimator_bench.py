@@ -1,12 +1,15 @@
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from gripper_force.cli import app
+from gripper_force.errors import DataError
 from gripper_force.jobs import int8_export
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench import estimator_bench as estimator
@@ -21,6 +24,7 @@ from gripper_force.qualification.bench.estimator_bench import (
     write_json,
 )
 from gripper_force.vision.header import Model
+from gripper_force.vision.model_files import read_model
 
 ROW = EstimatorCost(
     checkpoint="folder/force.safetensors",
@@ -115,3 +119,16 @@ def test_page_file_and_plot_hold_every_row(tmp_path: Path) -> None:
     assert [row["p50_ms"] for row in kept["estimator"]] == [100.0, 4.0, 1.0, 0.5]
     draw(tmp_path / "plot.png", rows)
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_logs_that_start_in_contact_are_left_out(
+    few_logs: Path, loaded_log: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def bench(sources: Sequence[str], *loaders: Callable[[Model], Sequence[Clip]] | object) -> None:
+        used = [len(load(read_model(sources[0]))) for load in loaders[:2] if callable(load)]
+        raise DataError(f"{used} of {len(list(few_logs.iterdir()))} logs")
+
+    monkeypatch.setattr(estimator, "bench", bench)
+    call = ["bench", "estimator", "--data", str(few_logs), "--scale-on", str(few_logs), "--jobs", "1"]
+    result = CliRunner().invoke(app, [*call, "--checkpoint", str(tiny_checkpoint)])
+    assert str(result.exception) == "[3, 3] of 4 logs"

@@ -1,6 +1,8 @@
 import json
 import math
+import shutil
 import socket
+import sys
 import threading
 from pathlib import Path
 
@@ -47,6 +49,12 @@ def test_a_server_that_is_no_foxglove_server_ends_the_measurement() -> None:
         with pytest.raises(GripperError, match=r"could not use the Foxglove server at ws://.*404 Not Found"):
             loop._foxglove_client(f"ws://127.0.0.1:{server.getsockname()[1]}")
         answers.join()
+
+
+def test_a_virtual_servo_that_does_not_start_ends_the_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", shutil.which("true"))
+    with pytest.raises(GripperError, match="the virtual servo did not start"), loop._virtual_servo():
+        pass
 
 
 def test_bench_loop_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> None:
