@@ -5,7 +5,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import SimpleQueue
-from threading import Thread
+from threading import Thread, current_thread
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -60,10 +60,13 @@ class _OneThread:
 
     def __init__(self) -> None:
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
-        Thread(target=self._run, name="renderer", daemon=True).start()
+        self._thread = Thread(target=self._run, name="renderer", daemon=True)
+        self._thread.start()
 
     def run(self, function: Callable[[], _T]) -> _T:
         """Returns or raises what the function returns or raises."""
+        if current_thread() is self._thread:  # a world that is deleted there closes itself there
+            return function()
         result: Future[_T] = Future()
         self._calls.put((result, function))
         return result.result()
@@ -79,6 +82,7 @@ class _OneThread:
                 result.set_result(function())
             except BaseException as error:  # raised in the thread that waits
                 result.set_exception(error)
+            del call, result, function  # they refer to the world, which could not be deleted while this waits
 
 
 class Motor(Protocol):

@@ -1,8 +1,11 @@
+import gc
 import math
 import os
 import subprocess
 import sys
 import textwrap
+import threading
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -151,6 +154,27 @@ def test_any_thread_renders_the_same_images_and_closes(make_world: Callable[...,
             image = shared.render(64) if thread is None else thread.submit(shared.render, 64).result()
             assert (image == alone.render(64)).all()
         another.submit(shared.close).result()
+
+
+def test_world_that_was_rendered_is_freed_without_close() -> None:
+    world = World(Scene("block", "coarse"), GripperConfig(), Current(0.0), NM_PER_A, 0)
+    world.render(16)
+    kept, threads = weakref.ref(world), [t for t in threading.enumerate() if t.name == "renderer"]
+    del world
+    gc.collect()  # the world refers to itself
+    assert kept() is None
+    threads[-1].join(10)
+    assert not threads[-1].is_alive()
+
+
+def test_world_whose_last_user_is_its_renderer_closes_itself() -> None:
+    worlds = [World(Scene("block", "coarse"), GripperConfig(), Current(0.0), NM_PER_A, 0)]
+    worlds[0].render(16)
+    graphics = worlds[0]._graphics
+    assert graphics is not None
+    graphics.run(lambda: worlds.pop().close())
+    graphics._thread.join(10)
+    assert not graphics._thread.is_alive()
 
 
 @pytest.mark.parametrize("tool", ["pads", "rods"])
