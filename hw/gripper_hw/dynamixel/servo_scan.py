@@ -59,13 +59,12 @@ def scan(
 def _scan_port(config: Config, name: str, baud_rates: tuple[int, ...], progress: Progress) -> PortScan:
     found: dict[int, FoundServo] = {}
     problems: list[str] = []
-    virtual = name.startswith(VIRTUAL_PREFIX)
     with ExitStack() as stack:
-        if virtual:
+        if name.startswith(VIRTUAL_PREFIX):
             alone = keep_only(config.with_values(servo={"port": name}), "servo")
             stack.enter_context(open_devices(alone))
-        # Bytes pass a virtual port at any rate.
-        for rate in (config.servo.baud_rate,) if virtual else baud_rates:
+            baud_rates = (config.servo.baud_rate,)  # bytes pass a virtual port at any rate
+        for rate in baud_rates:
             progress(f"{name} at {rate} baud", 0)
             at_rate = config.servo.model_copy(update={"port": name, "baud_rate": rate, "retries": 0})
             try:
