@@ -90,11 +90,12 @@ class ServoContract:
         return 0.4
 
     @pytest.fixture(autouse=True)
-    def _stop_and_close(self, servo: Servo) -> Iterator[None]:
+    def _stop_and_close(self, servo: Servo, second_servo: Servo | None) -> Iterator[None]:
         yield
-        with suppress(DeviceError):
-            servo.stop(hold=False)
-        servo.close()
+        for one in (servo,) if second_servo is None else (servo, second_servo):
+            with suppress(DeviceError):
+                one.stop(hold=False)
+            one.close()
 
     # Spec.
 

@@ -1,5 +1,8 @@
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -61,3 +64,47 @@ def test_right_units_pass() -> None:
 def test_wrong_units_and_signs_of_velocity_and_current_fail(factors: dict[str, float]) -> None:
     with pytest.raises(AssertionError):
         check(**factors)
+
+
+def test_second_servo_that_should_have_been_refused_is_stopped_and_closed(tmp_path: Path) -> None:
+    module = tmp_path / "test_shared.py"
+    module.write_text(
+        f"""
+import sys
+
+import pytest
+
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_servo_contract import Scaled
+from gripper_force.testing.servo_contract import ServoContract
+
+
+class Noted(Scaled):
+    def stop(self, *, hold): print("stopped")
+    def close(self): print("closed")
+
+
+class TestShared(ServoContract):
+    @pytest.fixture
+    def servo(self): return Scaled(1.0, 1.0)
+
+    @pytest.fixture
+    def second_servo(self): return Noted(1.0, 1.0)
+""",
+        encoding="utf-8",
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-s",
+        "-p",
+        "no:cacheprovider",
+        "-k",
+        "second_servo",
+        str(module),
+    ]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "DID NOT RAISE" in run.stdout
+    assert "stopped\nclosed\n" in run.stdout
