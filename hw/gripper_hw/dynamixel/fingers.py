@@ -63,7 +63,7 @@ class FingerPair:
         return self._sign * (second_rad - self._config.offset_rad) - first_rad
 
     def start_problem(self, first_rad: float, second_rad: float) -> str:
-        """Returns why two servo positions are no start, or an empty text."""
+        """Returns why a run can't start at two servo positions, or an empty text."""
         difference_rad = abs(self.difference_rad(first_rad, second_rad))
         max_rad = self._config.max_difference_rad / 2
         if difference_rad <= max_rad:

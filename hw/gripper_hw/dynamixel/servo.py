@@ -177,7 +177,7 @@ class DynamixelBus:
         return states
 
     def read(self) -> tuple[ServoState, ...]:
-        """Reads every servo in one transaction, and every 20th time in another one a voltage that does not fit.
+        """Reads every servo in one transaction, and every 20 cycles in another one the voltage, if it does not fit.
 
         Raises:
             HardwareFaultError: A servo's watchdog tripped, or it restarted and lost its settings. A hardware

@@ -237,9 +237,8 @@ class _Inspection:
         """Returns the EEPROM registers that a servo needs, the baud rate last."""
         wanted = {name: new for name, new in self._expected.items() if REGISTERS[name].eeprom}
         wanted["homing_offset"] = self._config.homing_offset
-        rate = next(
-            (rate for rate, code in BAUD_RATES.items() if code == self.transport.get(id_, "baud_rate")), 0
-        )
+        present = self.transport.get(id_, "baud_rate")
+        rate = next((rate for rate, code in BAUD_RATES.items() if code == present), 0)
         # A servo with another baud rate than the others on its bus would be lost to their program.
         if rate < FAST_BAUD_RATE and set(self.transport.scan()) == {id_}:
             wanted["baud_rate"] = BAUD_RATES[FAST_BAUD_RATE]

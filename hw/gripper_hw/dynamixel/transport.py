@@ -26,7 +26,7 @@ from gripper_hw.dynamixel.port import BorrowedPort, Port, open_port
 
 _READ_LENGTHS: Final = 8
 """A read requests 0 to 7 bytes more than it needs, in turn, so that a late reply to one of the seven previous
-requests has another length. The longest request fills the 20 bytes of an XL330's indirect data."""
+requests of as many bytes has another length. The longest request fills the 20 bytes of an XL330's indirect data."""
 
 _REPLY_TO_ALL: Final = 2
 """Status Return Level: a reply to every instruction."""
