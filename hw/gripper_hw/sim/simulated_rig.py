@@ -117,9 +117,8 @@ class SimulatedCamera:
     def _capture(self, t_ns: int) -> None:
         if self._closed:
             return
-        image = self._world.render(_SUPERSAMPLING * FRAME_SIDE_PX)
-        lux = self._scene.lux * self._surroundings.light_factor(t_ns / NS_PER_S)
-        scene = self._scene
+        scene, image = self._scene, self._world.render(_SUPERSAMPLING * FRAME_SIDE_PX)
+        lux = scene.lux * self._surroundings.light_factor(t_ns / NS_PER_S)
         gray = expose(image, lux * self._exposure, scene.shot_noise, self._rng, scene.camera_blur_px)
         t_ns += self._start_ns
         self._pending.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
@@ -222,7 +221,7 @@ class SimulatedRig:
         servos = [VirtualServo(id_, model) for id_ in config.servo.ids]
         bus = VirtualBus(servos, self._bus_time_ns)
         self._lockstep = config.clock == "lockstep"
-        start_ns = 0 if self._lockstep else time.monotonic_ns()
+        self.start_ns = start_ns = 0 if self._lockstep else time.monotonic_ns()
         faults = Faults(config.faults, start_ns)
         wire = None
         if config.faults:
@@ -251,9 +250,8 @@ class SimulatedRig:
                 )
         self._object_digest = "" if config.sim.object is None else digest(config.sim.object)
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)
-        clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
-        self.clock: Clock = clock
-        self.camera: Camera = SimulatedCamera(self._world, self.scene, config, clock, start_ns)
+        self.clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
+        self.camera: Camera = SimulatedCamera(self._world, self.scene, config, self.clock, start_ns)
         self.load_cell: LoadCell = SimulatedLoadCell(self._world, config, start_ns)
         self.wrap_estimator: Callable[[Any], Any] | None = None
         self.wrap_file: Callable[[BinaryIO], BinaryIO] | None = None
@@ -262,7 +260,6 @@ class SimulatedRig:
             self._wrap_in_faults(faults, config.seed)
         self._bus_name = config.servo.port.removeprefix(VIRTUAL_PREFIX)
         register_bus(self._bus_name, bus)
-        self.start_ns = start_ns
         self._failure: Exception | None = None
         self._stop, self._is_prepared = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
