@@ -39,6 +39,10 @@ MAX_CYCLE_S = 0.05
 _TRAVEL_SPEED_SHARE = 2.0
 """Speed of a release or move, as a share of the approach speed."""
 
+_RISING_SHARE = 0.95
+"""Largest speed while the force rises, as a share of the approach speed. Jaws that start from rest as their object leaves
+go beyond the speed of their voltage for one cycle."""
+
 _DWELL_S = 0.12
 """Time in contact before the ramp: the impact decays and vision catches up."""
 
@@ -421,7 +425,7 @@ class GraspController:
         if self._phase == Phase.APPROACH:
             return self._approach.speed_m_s
         is_rising = self._phase in (Phase.CONTACT, Phase.RAMP)
-        return self._config.approach_speed_m_s if is_rising else self._hold_m_s
+        return _RISING_SHARE * self._config.approach_speed_m_s if is_rising else self._hold_m_s
 
     @property
     def _derated_target_n(self) -> float:
