@@ -258,8 +258,9 @@ class SimulatedRig:
         self._closing = ExitStack()
         if config.faults:
             self._wrap_in_faults(faults, config.seed)
-        self._bus_name = config.servo.port.removeprefix(VIRTUAL_PREFIX)
-        register_bus(self._bus_name, bus)
+        bus_name = config.servo.port.removeprefix(VIRTUAL_PREFIX)
+        register_bus(bus_name, bus)
+        self._closing.callback(unregister_bus, bus_name)
         self._failure: Exception | None = None
         self._stop, self._is_prepared = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
@@ -351,7 +352,6 @@ class SimulatedRig:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
-        unregister_bus(self._bus_name)
         self._closing.close()
         self._world.close()
 

@@ -195,6 +195,16 @@ def test_closed_rig_leaves_no_bus_and_no_thread(make_rig: MakeRig) -> None:
     assert "simulated-rig" not in {thread.name for thread in threading.enumerate()}
 
 
+def test_second_close_leaves_the_bus_of_another_rig(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    rig.close()
+    other = make_rig()
+    rig.close()
+    assert find_bus("rig") is not None
+    other.close()
+    assert find_bus("rig") is None
+
+
 def error_of_patched_rig(make_rig: MakeRig, patch: Callable[[SimulatedRig], None]) -> BaseException:
     """Returns the exception that `check` raises for a patched rig in real time."""
     rig = make_rig("clock=realtime")
