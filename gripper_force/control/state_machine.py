@@ -39,9 +39,9 @@ MAX_CYCLE_S = 0.05
 _TRAVEL_SPEED_SHARE = 2.0
 """Speed of a release or move, as a share of the approach speed."""
 
-_RISING_SHARE = 0.95
+_RISING_SHARE = 0.97
 """Largest speed while the force rises, as a share of the approach speed. Jaws that start from rest as their object
-leaves go beyond the speed of their voltage for one cycle."""
+leaves go beyond the speed of their voltage for one cycle. Slower jaws on a soft object look like a loss."""
 
 _DWELL_S = 0.12
 """Time in contact before the ramp: the impact decays and vision catches up."""
