@@ -424,7 +424,7 @@ def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path
     )
     assert result["ignored"] == ["notes[1].txt"]
     assert Path("logs/train/sponge_30_100-01.mcap").is_file()
-    people = run("import", "database", "db", "--out", "logs")
+    people = run("import", "database", "db", "--out", "logs", "--rate-hz", 100)
     for text in ("sponge_30_100", "line 2, '2,0.5'", "the first is 2", "not imported notes[1].txt"):
         assert text in people.out
     assert "camera.rate_hz" in run("import", "database", "db", "--rate-hz", 0).err

@@ -11,7 +11,6 @@ from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_on
 from gripper_force.runtime.backends import open_devices
 from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS, Frame
-from gripper_force.vision.preprocess import downscale
 from gripper_hw.cameras import uvc
 
 _SYSFS = Path("/sys")
@@ -109,6 +108,8 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
     advice = f"every estimate would be older than control.vision_age_ms={limit_ms:.3g}: shorten the exposure"
     yield judged("camera", "latency", found, latency_ms < limit_ms, advice)
     if config.uses_vision:
+        from gripper_force.vision.preprocess import downscale  # `doctor` of a servo alone needs no vision
+
         downscale(frames[0].gray, config.vision.region, 1)  # raises if the region reaches beyond the frame
 
 
