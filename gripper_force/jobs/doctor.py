@@ -125,9 +125,8 @@ def _network(config: Config) -> Iterator[Check]:
     from gripper_force.vision.step_benchmark import engine_version
 
     config, model, _ = resolve_vision(config)
-    whole = config.with_values(
-        vision={"region": None}
-    )  # a region of the camera's frames, which can be larger
+    # The region is one of the camera's frames, which can be larger than those that this check makes.
+    whole = config.with_values(vision={"region": None})
     estimator = make_estimator(ResolvedConfig(whole, model))
     assert estimator is not None  # the configuration has vision
     vision = config.vision

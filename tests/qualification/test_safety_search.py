@@ -113,6 +113,12 @@ def test_a_soft_object_next_to_the_jaws_is_pressed_slowly(config: Config) -> Non
     assert run_case(config, 0, 7205).force_share < 1.0
 
 
+def test_a_stiff_object_that_leaves_the_ramp_does_not_make_the_jaws_too_fast(config: Config) -> None:
+    # 1.52 times the configured speed, for one cycle, as long as the ramp had all of it.
+    assert draw(config.control, RACK, 0, 7302).stiffness_n_m > 2e4
+    assert run_case(config, 0, 7302).ok
+
+
 @pytest.mark.parametrize("index", [732, 5053, 9847])
 def test_a_hold_with_a_small_limit_is_slow_when_its_object_leaves(config: Config, index: int) -> None:
     # 732, 9847: the object returned to jaws that closed with 15 mm/s: 1.9 and 1.4 times the limit. 5053: its loss was

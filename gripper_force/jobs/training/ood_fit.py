@@ -32,7 +32,7 @@ MIN_LOGS: Final = 8
 """Fewer logs with contact do not show how logs differ."""
 
 FOLDS: Final = 4
-"""Parts of the logs, each scored by the subspace of the others. Each needs a set of its own."""
+"""Parts of the logs, each scored by the subspace of the others. Each needs at least one set."""
 
 
 class _Seen(NamedTuple):

@@ -251,9 +251,8 @@ def _learned(
     if cell.method != "taught":
         return config, ""
     bundle = place / f"bundle-{cell.touches}"
-    shutil.rmtree(
-        out, ignore_errors=True
-    )  # `teach` continues what is there, and the time would be that of the rest
+    # `teach` continues what is there, and the measured time would be that of the rest.
+    shutil.rmtree(out, ignore_errors=True)
     taught = teach(config, cell.object, logs=touched, folder=out, out=bundle, workers=workers)
     config = config.with_values(
         calibration={"object": str((taught.bundle / "profile.yaml").absolute())},

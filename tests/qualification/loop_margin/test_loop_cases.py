@@ -53,6 +53,13 @@ def test_eight_times_the_gain_rings_with_late_vision() -> None:
     assert verdict(replace(TRUTH, stiffness_n_m=100.0), 0.08, plant_gain=1 / 8) == Verdict.RINGS
 
 
+@pytest.mark.parametrize("seed", [6, 7, 8])
+def test_a_very_soft_object_is_not_taken_for_lost(seed: int) -> None:
+    # With 0.95 of the approach speed in the ramp, the jaws fell behind it, and seed 6 ended as `slip`.
+    soft = replace(TRUTH, stiffness_n_m=100.0)
+    assert grasp(CONFIG, soft, 0.125, seed).verdict in (Verdict.HOLDS, Verdict.CURRENT)
+
+
 def test_object_out_of_reach_is_not_held() -> None:
     assert verdict(replace(TRUTH, contact_m=0.2)) == Verdict.LOSES
 
