@@ -14,6 +14,9 @@ _STEP_S: Final = 0.005
 _MAX_LAG_S: Final = 0.3
 _MIN_RISE_N: Final = 0.5
 _MIN_SAMPLES: Final = 20
+_HELD_SHARE: Final = 0.1
+"""Share of the rise of a press that is left out: until the ramp exceeds it, friction holds the force of the impact."""
+
 _MIN_DELAY_S: Final = 0.002
 _GAIN_RANGE: Final = (0.3, 3.0)
 _MIN_DENT_M: Final = 0.001
@@ -42,7 +45,8 @@ def fit_plant(presses: list[PressSeries], delay_s: float) -> LoopPlant | None:
     """Fits gain and lag to presses by least squares, and tunes the loop for them and a measured delay.
 
     Friction differs between presses and from its nominal value, so each press has its own offset. The ramp
-    determines gain and offset, and the transition into the hold determines the lag.
+    determines gain and offset, and the transition into the hold determines the lag. A press counts from where its
+    force rises: the impact leaves a force that friction holds while the motor force is still below it.
 
     Args:
         presses: Ramps and holds.
@@ -115,23 +119,29 @@ def crushing_touch(contact_width_m: Floats, peak_n: Floats) -> int | None:
     return crushing
 
 
-def _resample(press: PressSeries) -> tuple[Floats, Floats] | None:
-    """Motor force and contact force at even times, or None if the press is too short or too weak."""
+def _resample(press: PressSeries) -> tuple[Floats, Floats, int] | None:
+    """Motor force and contact force at even times and the index where the force rises, or None.
+
+    None means that the press is too short or too weak.
+    """
     if len(press.t_s) < _MIN_SAMPLES or np.ptp(press.force_n) < _MIN_RISE_N:
         return None
     t_s = np.arange(press.t_s[0], press.t_s[-1], _STEP_S)
     if len(t_s) < _MIN_SAMPLES:
         return None
-    return np.interp(t_s, press.t_s, press.motor_force_n), np.interp(t_s, press.t_s, press.force_n)
+    force_n = np.interp(t_s, press.t_s, press.force_n)
+    rise_n = force_n.max() - force_n[0]
+    rising = int(np.argmax(force_n - force_n[0] >= _HELD_SHARE * rise_n))
+    return np.interp(t_s, press.t_s, press.motor_force_n), force_n, rising
 
 
-def _fit_gain(presses: list[tuple[Floats, Floats]], lag_s: float) -> tuple[float, float]:
+def _fit_gain(presses: list[tuple[Floats, Floats, int]], lag_s: float) -> tuple[float, float]:
     """Residual sum of squares with this lag, and the best gain."""
     keep = float(np.exp(-_STEP_S / lag_s)) if lag_s > 0 else 0.0
     product = square = total = 0.0
-    for motor_force_n, force_n in presses:
-        lagged = lfilter([1 - keep], [1, -keep], motor_force_n, zi=[keep * motor_force_n[0]])[0]
-        lagged, force = lagged - lagged.mean(), force_n - force_n.mean()
+    for motor_force_n, force_n, rising in presses:
+        lagged = lfilter([1 - keep], [1, -keep], motor_force_n, zi=[keep * motor_force_n[0]])[0][rising:]
+        lagged, force = lagged - lagged.mean(), force_n[rising:] - force_n[rising:].mean()
         product, square, total = product + lagged @ force, square + lagged @ lagged, total + force @ force
     gain = product / max(square, 1e-12)
     return total - gain * product, gain

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,6 +31,16 @@ def test_gain_and_lag_are_recovered_with_any_friction(gain: float, lag_s: float,
     assert plant.lag_ms == pytest.approx(1e3 * lag_s, abs=8)
     assert plant.delay_ms == pytest.approx(40)
     assert plant.phase_margin_deg == pytest.approx(61.4, abs=0.1)  # SIMC's own, by its choice of gains
+
+
+@pytest.mark.parametrize("impact_n", [0.5, 1.5, 2.5])
+def test_force_of_the_impact_that_friction_holds_does_not_change_the_plant(impact_n: float) -> None:
+    press = pressed(1.0, 0.03, 0.0)
+    held = replace(press, force_n=np.maximum(press.force_n, press.force_n[0] + impact_n))
+    plant = fit_plant([held], 0.04)
+    assert plant is not None
+    assert plant.gain == pytest.approx(1.0, rel=0.02)
+    assert plant.lag_ms == pytest.approx(30, abs=5)
 
 
 def test_weak_presses_give_no_plant() -> None:
