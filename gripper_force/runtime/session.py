@@ -322,11 +322,6 @@ class Session:
             raise type(first)(f"{first}; and the servo could not be stopped: {second}") from first
         finally:
             self._perception.close()
-            if callable(settings := getattr(self._devices.camera, "settings", None)):
-                text = json.dumps(
-                    settings(), default=lambda v: getattr(v, "tolist", v.__repr__)(), skipkeys=True
-                )
-                self.attach("camera.json", text.encode(), "application/json")
         self._log_sensors(self._devices.clock.now_ns(), at_end=True)
 
     def log_event(self, unit: str, text: str) -> None:
@@ -370,6 +365,11 @@ class Session:
             for unit, count in counts.items():
                 if text := self._counter_monitors[unit].update(t_ns, count, at_end=at_end):
                     self._log(Event(t_ns, unit, text))
+            if at_end and callable(settings := getattr(devices.camera, "settings", None)):
+                text = json.dumps(
+                    settings(), default=lambda v: getattr(v, "tolist", v.__repr__)(), skipkeys=True
+                )
+                self.attach("camera.json", text.encode(), "application/json")
 
 
 @contextmanager

@@ -190,7 +190,9 @@ def test_the_jaws_open_after_a_fault_although_a_sensor_fails_again(
         assert list(LogReader(path).records(GraspStatus))[-1].width_m > 0.085
 
 
-@pytest.mark.parametrize(("unit", "method"), [("camera", "counts"), ("load_cell", "drain")])
+@pytest.mark.parametrize(
+    ("unit", "method"), [("camera", "counts"), ("camera", "settings"), ("load_cell", "drain")]
+)
 def test_a_sensor_that_fails_at_the_end_does_not_hide_the_error_before(
     config: Config, unit: str, method: str
 ) -> None:
@@ -230,6 +232,23 @@ def test_settings_that_fail_do_not_cost_the_log(config: Config, tmp_path: Path) 
     with pytest.raises(DeviceError, match=r"Camera\.settings\(\) raised ValueError: no settings here"):
         run_grasp(with_own(config, "camera", "settings"), tmp_path / "run.mcap")
     assert LogReader(tmp_path / "run.mcap").complete
+
+
+def test_a_camera_that_fails_at_the_end_does_not_hide_a_servo_that_does_not_stop(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*, hold: bool) -> None:
+        raise DeviceError("the servo does not answer")
+
+    settings = resolve(with_own(config, "camera", "settings"))
+    with open_devices(settings.config) as devices:
+        with (
+            pytest.raises(DeviceError, match=r"^the servo does not answer"),
+            open_session(settings, devices, None) as session,
+        ):
+            session.cycle()
+            monkeypatch.setattr(devices.servo, "stop", stop)
+        monkeypatch.undo()
 
 
 def test_a_servo_that_fails_is_told_to_stop(config: Config, tmp_path: Path) -> None:
