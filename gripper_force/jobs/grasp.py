@@ -16,6 +16,7 @@ from gripper_force.jobs.metrics import percentile
 from gripper_force.jobs.replay.comparison import load_cell_errors
 from gripper_force.jobs.score import (
     MIN_VISION_SHARE,
+    HoldVision,
     VisionLoss,
     controls_with_vision,
     score_grasp,
@@ -41,6 +42,7 @@ from gripper_force.types import (
 PAPER_OBJECTS: Final = ("sponge", "paper_cup", "tube", "stapler")
 """Simulated objects like the four of the dataset of Shin et al. 2019."""
 
+_NO_VISION: Final = "the configuration has no network or no camera"
 _CHOICE_EVENT: Final = "took "
 """Start of the event in which logs of version 0.1 name the network that ``auto`` chose."""
 
@@ -224,8 +226,10 @@ def summarise_grasp(path: Path) -> GraspSummary:
     vision_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
     config = config_from_text(reader.config, str(path))
     vision = vision_in_hold(statuses, records[FusedForce], visuals, records[Event])
-    shown = vision if controls_with_vision(config) else None
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
+    shown = vision if expects_vision else None
+    if shown is not None and not config.uses_vision:
+        shown = HoldVision(0.0, [VisionLoss(_NO_VISION, sum(loss.time_s for loss in shown.losses))])
     # A release that fails does not change what the grasp reached.
     outcomes = [s.outcome for s in statuses if s.outcome not in (Outcome.NONE, Outcome.BLOCKED)]
     result = outcomes[-1] if outcomes else "interrupted"

@@ -153,7 +153,10 @@ def test_motor_current_alone_has_no_share_of_vision(
 
 def test_feedback_from_vision_without_a_camera_fell_back(quick: list[str], tmp_path: Path) -> None:
     summary = grasped([*quick, "control.feedback=vision"], tmp_path)
-    assert (summary["vision_share"], summary["fell_back"]) == (None, True)
+    assert (summary["vision_share"], summary["fell_back"]) == (0.0, True)
+    [loss] = summary["vision_losses"]
+    assert loss.reason == "the configuration has no network or no camera"
+    assert loss.time_s > 0
 
 
 REAL = ["clock=realtime", "servo.port=/dev/ttyUSB7", "camera.backend=none", "load_cell.backend=none"]
