@@ -66,8 +66,8 @@ def grasp(
         int,
         typer.Option(
             min=0,
-            help="Number of grasps, with statistics: of --object, or in simulation of the four paper objects in "
-            "turn; with --target-n, or targets of 1 to 8 N.",
+            help="Number of grasps, with statistics: of the given object, or in simulation of the four paper objects "
+            "in turn; with the given target force, or targets of 1 to 8 N.",
         ),
     ] = 0,
     same_object: Annotated[
@@ -113,7 +113,9 @@ def grasp(
             "calibration.object": profile,
         },
     )
-    named = object_ is not None or settings.sim.object is not None
+    own = {text.partition("=")[0] for text in set_ or ()}
+    named = object_ is not None or "object" in own or settings.sim.object is not None
+    own_target_n = settings.target_n if target_n is not None or "target_n" in own else None
     one_object = not trials or bool(job.exclusive_device(settings)) or same_object or named
     objects = (settings.object,) if one_object else job.PAPER_OBJECTS
     for text in dict.fromkeys(text for name in objects for text in _notes(settings, name)):
@@ -121,7 +123,7 @@ def grasp(
     if not trials:
         _grasp_once(settings, view, as_json)
     else:
-        _grasp_trials(settings, trials, objects, target_n, same_object, jobs, yes, as_json)
+        _grasp_trials(settings, trials, objects, own_target_n, same_object, jobs, yes, as_json)
 
 
 def _grasp_once(settings: "Config", view: str | None, as_json: bool) -> None:

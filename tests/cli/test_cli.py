@@ -256,7 +256,7 @@ def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
     assert set(result) == {"trials", "summary", "figure"}
     (trial,) = result["trials"]
     assert set(trial) >= GRASP_KEYS
-    assert trial["object"] == "sponge"
+    assert (trial["object"], trial["target_n"]) == ("stapler", 3)  # those of --set
     assert result["summary"]["trials"] == 1
     assert result["summary"]["median_error_percent"] is not None
 
