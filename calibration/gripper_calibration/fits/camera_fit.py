@@ -7,7 +7,7 @@ from typing import Final
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from gripper_force.errors import DataError
 from gripper_force.profiles.rig_profile import CalibratedValue
@@ -170,7 +170,7 @@ def estimate_lag(touches: Sequence[CameraLag]) -> CalibratedValue:
             "samples/s"
         )
     value = float(np.median(lags_ms))
-    mean_ms = float(student.ppf(0.975, count - 1) * lags_ms.std(ddof=1) / np.sqrt(count))
+    mean_ms = float(stdtrit(count - 1, 0.975) * lags_ms.std(ddof=1) / np.sqrt(count))
     # The median of many normal draws scatters sqrt(pi / 2) times as much as their mean, that of few a bit less.
     scatter_ms = np.sqrt(np.pi / 2) * mean_ms
     half_ms = float(np.hypot(scatter_ms, METHOD_ERROR_MS))

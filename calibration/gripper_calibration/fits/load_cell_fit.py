@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy.special import stdtrit
 
 from gripper_force.errors import DataError
 from gripper_force.profiles.rig_profile import CalibratedValue
@@ -134,7 +134,7 @@ def rest_statistics(rest: Rest, scale: float, name: str, step_raw: float = math.
     rate, offset = np.polyfit(batches_t_s - batches_t_s.mean(), batches, 1)
     trend = offset + rate * (batches_t_s - batches_t_s.mean())
     spread = float(np.sqrt(np.sum((batches - trend) ** 2) / (BATCHES - 2)))
-    quantile = float(stats.t.ppf(0.975, BATCHES - 2))
+    quantile = float(stdtrit(BATCHES - 2, 0.975))
     span = float(np.sqrt(np.sum((batches_t_s - batches_t_s.mean()) ** 2)))
     noise = float(np.std(raw - centre - offset - rate * (t_s - batches_t_s.mean())))
     return RestStatistics(

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy.special import stdtrit
 
 from gripper_force.errors import DataError
 from gripper_force.profiles.rig_profile import CalibratedValue
@@ -388,7 +388,7 @@ def _jackknife(
         without.append(parameters(_least_squares(part)))
     count = len(clusters)
     error = np.sqrt((count - 1) / count * np.sum((np.array(without) - values) ** 2, axis=0))
-    return values, np.asarray(error * stats.t.ppf(0.975, max(count - between, 1)), np.float64)
+    return values, np.asarray(error * stdtrit(max(count - between, 1), 0.975), np.float64)
 
 
 def _least_squares(data: Regression) -> Floats:

@@ -6,7 +6,7 @@ from typing import Final, NoReturn
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from gripper_calibration.procedures.calibrate_servo import PLAUSIBLE_RATIO
 from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
@@ -200,7 +200,7 @@ def _breakaway_n(empty: "_Balance") -> float:
 
 def _half(values: npt.NDArray[np.float64]) -> float:
     """Half of the 95 % interval of a mean."""
-    return float(student.ppf(0.975, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values)))
+    return float(stdtrit(len(values) - 1, 0.975) * values.std(ddof=1) / math.sqrt(len(values)))
 
 
 @dataclass(frozen=True, slots=True)
