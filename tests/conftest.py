@@ -5,11 +5,12 @@ import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+import typer.testing
 from hypothesis import settings
 
 from gripper_force.config import dump_config, load_config
@@ -43,6 +44,16 @@ def pytest_collection_finish() -> None:
     """Keeps the tests themselves, hundreds of thousands of objects, out of every later garbage collection."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_command_line() -> Iterator[None]:
+    """Makes the command line once: typer would make it for each call, which takes longer than many a command."""
+    made = cache(typer.main.get_command)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.main, "get_command", made)
+        patch.setattr(typer.testing, "_get_command", made)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -130,6 +141,17 @@ def servo_calibration() -> ServoCalibration:
 
 
 @pytest.fixture(scope="session")
+def current_log(quick: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole lockstep grasp on motor current alone. Not to be written to."""
+    from gripper_force.config import load_config
+    from gripper_force.jobs.grasp import run_grasp
+
+    path = tmp_path_factory.mktemp("current") / "grasp.mcap"
+    run_grasp(load_config(None, quick), path)
+    return path
+
+
+@pytest.fixture(scope="session")
 def fused_log(quick_vision: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole lockstep grasp with vision. Not to be written to."""
     from gripper_force.config import load_config
@@ -175,6 +197,8 @@ def own_process() -> None:
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """Sums split over threads differ in their last bits, and threads contend where tests run side by side."""
+    import torch
+
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

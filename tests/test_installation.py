@@ -8,10 +8,11 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from packaging.requirements import Requirement
@@ -89,12 +90,10 @@ from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.pty_server import BenchMotor, PtyServer
 from gripper_hw.dynamixel.virtual import VirtualBus
 
-motor = BenchMotor(VirtualServo(1, load_model("XM430-W350")), contact_rad=1.5)
+motor = BenchMotor(VirtualServo(1, load_model("XM430-W350")), contact_rad=0.5)
 server = PtyServer(VirtualBus([motor.servo], before_packet=lambda: motor.advance(time.monotonic_ns())))
 sys.argv = [text.replace("SERVO", server.device_path) for text in sys.argv]
 """
-
-MAIN = "from gripper_force.cli import main\nmain()\n"
 
 REAL = ("clock=realtime", "servo.port=SERVO", "load_cell.backend=none", "log.report=false")
 PATIENT = ("servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=100")
@@ -102,9 +101,9 @@ PATIENT = ("servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=100")
 
 
 def without_extras(
-    *arguments: str, cwd: Path, code: str = MAIN, path: str | None = None
+    *arguments: str, cwd: Path, code: str, path: str | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Runs the command line, or a program, in a process that has only the core's packages."""
+    """Runs a program in a process that has only the core's packages."""
     hidden = {name for module in absent() for name in distributions()[module]}
     absence = ABSENCE.format(absent=[sorted(absent()), sorted(hidden)])
     environment = {
@@ -128,21 +127,19 @@ def settings(*keys: str) -> list[str]:
 
 
 def test_the_absence_is_real(tmp_path: Path) -> None:
-    for module in ("torch", "mujoco", "matplotlib", "scipy", "depthai"):
-        assert module in absent()
-        done = without_extras(cwd=tmp_path, code=f"import {module}")
-        assert f"ModuleNotFoundError: No module named '{module}'" in done.stderr
-    code = "import cv2, google.protobuf, mcap, numpy, onnxruntime, pydantic, safetensors, serial, typer, yaml"
-    assert without_extras(cwd=tmp_path, code=code).returncode == 0
-
-
-def test_a_grasp_on_motor_current_needs_the_core_only(tmp_path: Path) -> None:
-    keys = settings(*REAL, *PATIENT, "camera.backend=none", "control.feedback=current", "control.hold_s=0.3")
-    done = without_extras("grasp", "--target-n=3", "--json", *keys, cwd=tmp_path, code=SERVO + MAIN)
-    assert done.returncode == 0, done.stderr
-    result = json.loads(done.stdout)
-    assert result["result"] == "held"
-    assert Path(tmp_path, result["log"]).is_file()
+    code = """
+from importlib import import_module
+import cv2, google.protobuf, mcap, numpy, onnxruntime, pydantic, safetensors, serial, typer, yaml
+for module in sys.argv[1:]:
+    try:
+        import_module(module)
+    except ModuleNotFoundError as error:
+        print(error)
+"""
+    optional = ("torch", "mujoco", "matplotlib", "scipy", "depthai")
+    assert absent() >= set(optional)
+    done = without_extras(*optional, cwd=tmp_path, code=code)
+    assert done.stdout.splitlines() == [f"No module named '{module}'" for module in optional], done.stderr
 
 
 VISION = """
@@ -161,16 +158,17 @@ with LogWriter(Path("frames.mcap"), config=dump_config(Config()), metadata={}) a
 """
 
 
-def test_a_grasp_with_vision_needs_the_core_only(tmp_path: Path) -> None:
-    camera = ("camera.backend=playback", "camera.path=frames.mcap", "control.feedback=fused")
-    keys = settings(*REAL, *PATIENT, "vision.checkpoint=small", *camera, "control.hold_s=0.3")
-    done = without_extras("grasp", "--target-n=3", "--json", *keys, cwd=tmp_path, code=VISION + SERVO + MAIN)
-    assert done.returncode in (0, 1), done.stderr  # noise is no object, so the outcome does not count
-    result = json.loads(done.stdout)
-    assert result["estimator_p50_ms"] > 0
-    visual = list(gf.LogReader(tmp_path / result["log"]).records(gf.VisualForce))
-    assert len(visual) > 10
-
+CURRENT = settings(*REAL, *PATIENT, "camera.backend=none", "control.feedback=current", "control.hold_s=0.3")
+PLAYBACK = ("camera.backend=playback", "camera.path=frames.mcap")
+SEEN = settings(
+    *REAL, *PATIENT, *PLAYBACK, "vision.checkpoint=small", "control.feedback=fused", "control.hold_s=0.3"
+)
+WORKING = {
+    "a grasp on motor current": ["grasp", "--target-n=3", "--json", *CURRENT],
+    "a grasp with vision": ["grasp", "--target-n=3", "--json", *SEEN],
+    "doctor": ["doctor", "--json", *CURRENT],
+}
+"""Commands that need the core only."""
 
 LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}"
 
@@ -182,7 +180,7 @@ MISSING: list[tuple[list[str], str, str]] = [
     (
         [
             "grasp",
-            *settings(*REAL, "camera.backend=playback", "camera.path=frames.mcap", "vision.engine=torch"),
+            *settings(*REAL, *PLAYBACK, "vision.engine=torch"),
         ],
         "vision.engine=torch needs torch",
         "train",
@@ -231,79 +229,127 @@ from gripper_force.cli import main
 done = []
 for arguments in json.loads(sys.argv[1]):
     sys.argv[1:] = arguments
-    with contextlib.redirect_stderr(io.StringIO()) as stderr:
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             main()
         except SystemExit as end:
-            done.append((end.code, stderr.getvalue()))
+            code = end.code
+    done.append((code, *(stream.seek(0) or stream.read() for stream in (out, err))))
 print(json.dumps(done))
 """
-"""Runs commands that fail, one after the other."""
+"""Runs commands, one after the other: the start of a process takes most of the time."""
+
+
+class Done(NamedTuple):
+    """The end of a command."""
+
+    code: int
+    out: str
+    err: str
+
+
+def each_without_extras(
+    commands: Iterable[list[str]], cwd: Path, before: str = "", path: str | None = None
+) -> list[Done]:
+    """Runs commands in one process that has only the core's packages."""
+    done = without_extras(json.dumps([*commands]), cwd=cwd, code=before + EACH, path=path)
+    assert done.returncode == 0, done.stderr
+    return [Done(*one) for one in json.loads(done.stdout.splitlines()[-1])]
 
 
 @pytest.fixture(scope="module")
-def messages(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str]]:
-    """Exit codes and messages of the commands in `MISSING`, from one process: its start takes most of the time."""
-    code = VISION + SERVO + EACH
-    commands = json.dumps([arguments for arguments, *_ in MISSING])
-    done = without_extras(commands, cwd=tmp_path_factory.mktemp("missing"), code=code)
-    assert done.returncode == 0, done.stderr
-    found: list[tuple[int, str]] = json.loads(done.stdout.splitlines()[-1])
-    return found
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of `ends`."""
+    return tmp_path_factory.mktemp("core")
 
 
-@pytest.mark.parametrize("number", range(len(MISSING)), ids=[" ".join(row[0]) for row in MISSING])
-def test_a_missing_package_is_named_with_its_extra(messages: list[tuple[int, str]], number: int) -> None:
-    _, needs, extra = MISSING[number]
-    code, stderr = messages[number]
-    assert code == 2, stderr
-    assert needs in stderr
-    assert f"pip install 'gripper-force[{extra}]'" in stderr
-    assert len([line for line in stderr.splitlines() if "error" in line]) == 1
-    assert "Traceback" not in stderr
+@pytest.fixture(scope="module")
+def ends(folder: Path) -> dict[str, Done]:
+    """The ends of the commands in `WORKING` and `MISSING`."""
+    commands = {**WORKING, **{" ".join(arguments): arguments for arguments, *_ in MISSING}}
+    done = each_without_extras(commands.values(), folder, VISION + SERVO)
+    return dict(zip(commands, done, strict=True))
 
 
-def test_a_library_user_gets_a_typed_error(tmp_path: Path) -> None:
+def test_a_grasp_on_motor_current_needs_the_core_only(ends: dict[str, Done], folder: Path) -> None:
+    code, out, err = ends["a grasp on motor current"]
+    assert code == 0, err
+    result = json.loads(out)
+    assert result["result"] == "held"
+    assert (folder / result["log"]).is_file()
+
+
+def test_a_grasp_with_vision_needs_the_core_only(ends: dict[str, Done], folder: Path) -> None:
+    code, out, err = ends["a grasp with vision"]
+    assert code in (0, 1), err  # noise is no object, so the outcome does not count
+    result = json.loads(out)
+    assert result["estimator_p50_ms"] > 0
+    visual = list(gf.LogReader(folder / result["log"]).records(gf.VisualForce))
+    assert len(visual) > 10
+
+
+def test_doctor_works_without_extras(ends: dict[str, Done]) -> None:
+    checks = json.loads(ends["doctor"].out)["checks"]
+    assert not [check for check in checks if "defect" in check["advice"]]
+    assert "no OAK can be listed: pip install 'gripper-force[oak]'" in [check["found"] for check in checks]
+
+
+@pytest.mark.parametrize(
+    ("command", "needs", "extra"), [(" ".join(row[0]), *row[1:]) for row in MISSING], ids=lambda value: value
+)
+def test_a_missing_package_is_named_with_its_extra(
+    ends: dict[str, Done], command: str, needs: str, extra: str
+) -> None:
+    code, _, err = ends[command]
+    assert code == 2, err
+    assert needs in err
+    assert f"pip install 'gripper-force[{extra}]'" in err
+    assert len([line for line in err.splitlines() if "error" in line]) == 1
+    assert "Traceback" not in err
+
+
+def test_a_library_user_gets_a_typed_error(tmp_path: Path, tiny_checkpoint: Path) -> None:
     code = """
 import gripper_force as gf
-for call in (lambda: gf.teach, lambda: gf.open_gripper().__enter__(), lambda: gf.ForceEstimator.load(engine="torch")):
+for call in (
+    lambda: gf.teach,
+    lambda: gf.open_gripper().__enter__(),
+    lambda: gf.ForceEstimator.load(engine="torch"),
+    lambda: gf.ForceEstimator.load(sys.argv[1]),  # its folder has no exported network
+):
     try:
         call()
-    except gf.ConfigError as error:
+    except gf.GripperError as error:
         print(error)
 """
-    done = without_extras(cwd=tmp_path, code=code)
-    assert done.stdout.splitlines() == [
+    done = without_extras(str(tiny_checkpoint), cwd=tmp_path, code=code)
+    *errors, not_exported = done.stdout.splitlines()
+    assert errors == [
         "gripper_force.teach needs torch, which is not installed; pip install 'gripper-force[train]'",
         "servo.port=virtual:rig needs mujoco, which is not installed; pip install 'gripper-force[sim]'",
         "vision.engine=torch needs torch, which is not installed; pip install 'gripper-force[train]', or set "
         "vision.engine=onnxruntime",
     ], done.stderr
-
-
-def test_a_checkpoint_without_export_says_what_to_do(tmp_path: Path, tiny_checkpoint: Path) -> None:
-    code = f"import gripper_force as gf\ngf.ForceEstimator.load({str(tiny_checkpoint)!r})"
-    done = without_extras(cwd=tmp_path, code=code)
-    assert "needs torch, which is not installed" in done.stderr
+    assert "needs torch, which is not installed" in not_exported
     assert (
         "or run `gripper-force export network` on another machine and set vision.checkpoint to its file"
-        in done.stderr
+        in not_exported
     )
 
 
-def test_doctor_works_without_extras(tmp_path: Path) -> None:
-    keys = settings(*REAL, *PATIENT, "camera.backend=none", "control.feedback=current")
-    done = without_extras("doctor", "--json", *keys, cwd=tmp_path, code=SERVO + MAIN)
-    checks = json.loads(done.stdout)["checks"]
-    assert not [check for check in checks if "defect" in check["advice"]]
-    assert "no OAK can be listed: pip install 'gripper-force[oak]'" in [check["found"] for check in checks]
+Trees = dict[str, list[ast.stmt]]
 
 
-def modules() -> Iterator[tuple[str, Path]]:
+@pytest.fixture(scope="module")
+def trees() -> Trees:
+    """The statements of each module, by its name."""
+    found: Trees = {}
     for package, root in SOURCES.items():
         for path in sorted((root / package).rglob("*.py")):
             name = ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
-            yield name, path
+            found[name] = ast.parse(path.read_text()).body
+    return found
 
 
 def imports(body: list[ast.stmt], *, lazy: bool) -> Iterator[str]:
@@ -327,20 +373,11 @@ def third_party(names: set[str]) -> set[str]:
     return tops - set(sys.stdlib_module_names) - set(SOURCES)
 
 
-TREES = {name: ast.parse(path.read_text()).body for name, path in modules()}
-EXTRA_DISTRIBUTIONS = {
-    canonicalize_name(Requirement(text).name): extra
-    for extra, texts in PROJECT["optional-dependencies"].items()
-    if extra not in ("dev", "all")
-    for text in texts
-}
-
-
-def test_every_import_is_declared() -> None:
+def test_every_import_is_declared(trees: Trees) -> None:
     """In the core, or in an extra that `EXTRAS` names for messages."""
     declared = {canonicalize_name(Requirement(text).name) for text in PROJECT["dependencies"]}
     names = {"foxglove": "foxglove-sdk", "rerun": "rerun-sdk", "Phidget22": "phidget22"}
-    for name, body in TREES.items():
+    for name, body in trees.items():
         for module in third_party(set(imports(body, lazy=True))):
             sources = distributions_of(module) or {names.get(module, module)}
             if not sources & declared and not (
@@ -358,17 +395,17 @@ def test_extras_of_messages_are_declared() -> None:
     assert set(EXTRAS.values()) <= set(PROJECT["optional-dependencies"])
 
 
-def loaded_with(start: str) -> dict[str, str]:
+def loaded_with(start: str, trees: Trees) -> dict[str, str]:
     """Third-party modules that an import of a module loads, and through which module."""
     seen: set[str] = set()
     found: dict[str, str] = {}
     todo = [start]
     while todo:
         name = todo.pop()
-        if name in seen or name not in TREES:
+        if name in seen or name not in trees:
             continue
         seen.add(name)
-        direct = set(imports(TREES[name], lazy=False))
+        direct = set(imports(trees[name], lazy=False))
         found |= {module: name for module in third_party(direct) if module not in found}
         for one in {*direct, name}:
             parts = one.split(".")
@@ -381,7 +418,7 @@ def own_class_modules() -> list[str]:
     return sorted({path.partition(":")[0] for table in built_in for path in table.values() if path})
 
 
-def test_optional_packages_are_reached_only_lazily() -> None:
+def test_optional_packages_are_reached_only_lazily(trees: Trees) -> None:
     """Commands, the runtime and every class that a run names load the core's packages, and their own one."""
     own = {
         "gripper_hw.sim.simulated_rig": {"mujoco"},
@@ -393,9 +430,8 @@ def test_optional_packages_are_reached_only_lazily() -> None:
     starts = ["gripper_force.cli", "gripper_force.runtime.gripper", "gripper_force.vision.estimator"]
     starts += [f"gripper_force.jobs.{job}" for job in jobs] + own_class_modules()
     for start in starts:
-        optional = {
-            module: via for module, via in loaded_with(start).items() if not distributions_of(module) & core()
-        }
+        loaded = loaded_with(start, trees)
+        optional = {module: via for module, via in loaded.items() if not distributions_of(module) & core()}
         assert set(optional) <= own.get(start, set()), f"{start}: {optional}"
 
 
@@ -427,23 +463,28 @@ def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
 
 
 def test_files_of_the_package_come_with_the_wheel(wheel: Path, tmp_path: Path) -> None:
-    done = without_extras("config", "file", "--json", cwd=tmp_path, path=str(wheel))
-    assert done.returncode == 0, done.stderr
-    files = {name: Path(path) for name, path in json.loads(done.stdout).items()}
+    examples = wheel / "gripper_force" / "examples"
+    shown = (examples / "xm430.yaml", examples / "setups" / "xm430_oak_hx711.yaml")
+    commands = [["config", "file", "--json"]]
+    commands += [
+        command
+        for path in shown
+        for command in (["config", "file", path.name], ["config", "show", f"--config={path}"])
+    ]
+    listed, *printed = each_without_extras(commands, tmp_path, path=str(wheel))
+    files = {name: Path(path) for name, path in json.loads(listed.out).items()}
     assert set(files) == set(shipped_files())
-    assert {"99-gripper-force.rules", "foxglove_layout.json", "xm430_oak_hx711.yaml"} <= set(files)
+    assert {"99-gripper-force.rules", "foxglove_layout.json"} <= set(files)
     assert all(path.is_relative_to(wheel) and path.is_file() for path in files.values())
-    for name in ("xm430.yaml", "xm430_oak_hx711.yaml"):
-        done = without_extras("config", "file", name, cwd=tmp_path, path=str(wheel))
-        (tmp_path / name).write_text(done.stdout)
-        done = without_extras("config", "show", f"--config={name}", cwd=tmp_path, path=str(wheel))
-        assert done.returncode == 0, done.stderr
+    for path, file, configuration in zip(shown, printed[::2], printed[1::2], strict=True):
+        assert (files[path.name], file.out) == (path, path.read_text())
+        assert configuration.code == 0, configuration.err
 
 
-def test_messages_name_no_file_of_the_repository() -> None:
+def test_messages_name_no_file_of_the_repository(trees: Trees) -> None:
     """Such as docs/servos.md, which an installation does not have; but a command may write such a page."""
     paths = re.compile(r"(?<!--write )(?<!such as )\b(docs|hw|examples|calibration|scripts|tests)/[\w/.]+")
-    for name, body in TREES.items():
+    for name, body in trees.items():
         nodes = [node for statement in body for node in ast.walk(statement)]
         docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
         for node in nodes:
@@ -482,19 +523,6 @@ def test_metadata_of_the_wheel(wheel: Path) -> None:
 
 
 # --- the repository --------------------------------------------------------------------------------------------
-
-
-def test_links_of_the_readme_resolve() -> None:
-    for target in re.findall(r"\]\(([^)]+)\)", (ROOT / "README.md").read_text()):
-        path, _, anchor = target.partition("#")
-        if "://" in path:
-            continue
-        file = ROOT / path if path else ROOT / "README.md"
-        assert file.exists(), target
-        if anchor:
-            headings = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE)
-            slugs = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-            assert anchor in slugs, target
 
 
 def test_the_integrations_have_the_same_version() -> None:

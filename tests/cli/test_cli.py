@@ -17,19 +17,22 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from gripper_calibration.procedures import calibrate_servo
-from gripper_calibration.procedures.servo_measurement import measure
+from gripper_calibration.procedures import calibrate_jaws, calibrate_servo
+from gripper_calibration.procedures.calibrate_jaws import JawsResult
+from gripper_calibration.procedures.calibrate_servo import ServoResult
 from gripper_force import cli
 from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
 from gripper_force.cli.output.calibrate import rig_table
 from gripper_force.cli.output.runs import grasp_table, trials_table
-from gripper_force.config import load_config
+from gripper_force.config import Config, load_config
 from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import cpu
-from gripper_force.jobs.grasp import GraspSummary, summarise_grasp
+from gripper_force.jobs.grasp import PAPER_OBJECTS, GraspSummary, summarise_grasp
+from gripper_force.jobs.profile_files import update_rig
 from gripper_force.jobs.trials import TrialsSummary
+from gripper_force.profiles.rig_profile import CalibratedValue, ServoCalibration
 from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
 from gripper_hw.dynamixel.control_table import load_model
@@ -59,7 +62,7 @@ Run = Callable[..., Done]
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Iterator[Run]:
     """The command itself, but for the process."""
     monkeypatch.chdir(tmp_path)
-    handler = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in process.SIGNALS}
 
     def call(*arguments: object) -> Done:
         monkeypatch.setattr(sys, "argv", ["gripper-force", *map(str, arguments)])
@@ -70,7 +73,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
         return Done(int(end.value.code or 0), said.out, said.err)
 
     yield call
-    signal.signal(signal.SIGTERM, handler)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -145,7 +149,7 @@ def test_wrong_names_end_the_command_before_its_work(run: Run, fused_log: Path, 
 
 @pytest.mark.parametrize("command", ["train", "calibrate network"])
 def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_logs_are_read(
-    run: Run, fused_log: Path, tmp_path: Path, command: str
+    run: Run, current_log: Path, tmp_path: Path, command: str
 ) -> None:
     """The figure of a training has the ending .png, so it would replace a checkpoint of this name."""
     for out, words in (
@@ -154,9 +158,9 @@ def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_logs_are_read
         ("a.png", "can't write a checkpoint to a.png; name a file that ends in .safetensors"),
         ("a.onnx", "name a file that ends in .safetensors"),
         ("a", "name a file that ends in .safetensors"),
-        (fused_log / "a.safetensors", "name another file"),
+        (current_log / "a.safetensors", "name another file"),
     ):
-        found = run(*command.split(), fused_log, "--out", out)
+        found = run(*command.split(), current_log, "--out", out)
         assert (found.code, words in found.err) == (2, True), found.err
         assert "0/1" not in found.err  # logs
 
@@ -233,7 +237,10 @@ def test_grasp_prints_one_json_object(run: Run, sets: list[str]) -> None:
     assert (result["result"], result["object"], result["target_n"]) == ("held", "stapler", 2.5)
     assert result["estimator_p50_ms"] is None
     assert Path(result["log"]).is_file()
-    assert Path(result["report"]).read_text().startswith("<!")
+    assert Path(result["report"]) == Path(result["log"]).with_suffix(".html")
+    page = Path(result["report"]).read_text(encoding="utf-8")
+    assert page.startswith("<!")
+    assert "open loop" not in page
     for phase in ("approach", "contact", "ramp", "hold"):
         assert phase in done.err
 
@@ -252,30 +259,40 @@ def test_a_grasp_that_did_not_hold_has_an_exit_code(run: Run, sets: list[str]) -
 
 
 def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
-    result = run("grasp", "--json", "--trials", 1, "--jobs", 1, *sets).json()
+    result = run("grasp", "--json", "--trials", 2, "--jobs", 1, *sets).json()
     assert set(result) == {"trials", "summary", "figure"}
-    (trial,) = result["trials"]
-    assert set(trial) >= GRASP_KEYS
-    assert (trial["object"], trial["target_n"]) == ("stapler", 3)  # those of --set
-    assert result["summary"]["trials"] == 1
+    assert all(set(trial) >= GRASP_KEYS for trial in result["trials"])
+    found = [(trial["object"], trial["target_n"], trial["seed"]) for trial in result["trials"]]
+    assert found == [("stapler", 3, 0), ("stapler", 3, 1)]  # object and target of --set
+    assert result["summary"]["trials"] == 2
     assert result["summary"]["median_error_percent"] is not None
+    assert list(result["summary"]["estimate_mae_n"]) == ["all", "stapler"]
 
 
-def test_trials_of_one_object(run: Run, sets: list[str]) -> None:
-    result = run(
-        "grasp", "--json", "--trials", 2, "--object", "tube", "--target-n", 2, "--jobs", 1, *sets
-    ).json()
-    assert [(t["object"], t["target_n"], t["seed"]) for t in result["trials"]] == [
-        ("tube", 2, 0),
-        ("tube", 2, 1),
-    ]
-    assert list(result["summary"]["estimate_mae_n"]) == ["all", "tube"]
+@pytest.fixture
+def grasped(monkeypatch: pytest.MonkeyPatch, current_log: Path) -> None:
+    """Trials only say that they held their object."""
+
+    def grasp(config: Config, *_: object) -> GraspSummary:
+        return {**summarise_grasp(current_log), "object": config.object, "target_n": config.target_n}
+
+    monkeypatch.setattr("gripper_force.jobs.trials.grasp", grasp)
+
+
+@pytest.mark.usefixtures("grasped")
+def test_simulated_trials_are_of_the_papers_objects_in_turn_or_of_the_given_one(run: Run) -> None:
+    options = ("--json", "--trials", 5, "--jobs", 1, "--set", "log.report=false")
+    trials = run("grasp", *options).json()["trials"]
+    assert [trial["object"] for trial in trials] == [*PAPER_OBJECTS, PAPER_OBJECTS[0]]
+    assert len({trial["target_n"] for trial in trials}) == 5
+    trials = run("grasp", *options, "--object", "tube", "--target-n", 2).json()["trials"]
+    assert [(trial["object"], trial["target_n"]) for trial in trials] == 5 * [("tube", 2)]
 
 
 @pytest.fixture
 def port_options(sets: list[str]) -> Iterator[list[str]]:
-    """Options of a servo at a serial port, whose jaws meet an object."""
-    motor = BenchMotor(VirtualServo(1, load_model("XM430-W350")), contact_rad=1.5)
+    """Options of a servo at a serial port, whose jaws soon meet an object."""
+    motor = BenchMotor(VirtualServo(1, load_model("XM430-W350")), contact_rad=0.5)
     bus = VirtualBus([motor.servo], before_packet=lambda: motor.advance(time.monotonic_ns()))
     with PtyServer(bus) as server:
         values = (
@@ -291,7 +308,7 @@ def port_options(sets: list[str]) -> Iterator[list[str]]:
 
 
 class Terminal:
-    """Stands in for standard input at a terminal, and gives these answers."""
+    """Stands in for standard input at a terminal, and gives these answers, or Ctrl-C."""
 
     def __init__(self, *answers: str) -> None:
         self.answers = list(answers)
@@ -300,49 +317,64 @@ class Terminal:
         return True
 
     def readline(self) -> str:
-        return self.answers.pop(0)
+        answer = self.answers.pop(0)
+        if answer == "Ctrl-C":
+            os.kill(os.getpid(), signal.SIGINT)
+        return answer
 
 
 def test_trials_at_one_port_follow_one_another_and_wait_for_the_object(
-    run: Run, port_options: list[str], monkeypatch: pytest.MonkeyPatch
+    run: Run, port_options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     terminal = Terminal("\n", "\n")
     monkeypatch.setattr(sys, "stdin", terminal)
-    done = run("grasp", "--trials", 2, *port_options)
+    done = run("grasp", "--trials", 2, "--target-n", 3, *port_options)
     assert (done.code, terminal.answers) == (0, []), done.err
     assert "only one process can open servo.port=/dev/pts/" in done.err
     for number in (1, 2):
         assert f"Put the mug between the jaws for trial {number} of 2, then press Enter" in done.err
     assert done.out.count("mug") == done.out.count(" held ") == 2
     assert "No load cell: force errors, overshoot and peaks can't be measured." in done.out
+    assert len(list((tmp_path / "runs").glob("*-mug-3N-*.mcap"))) == 2
 
 
+@pytest.mark.usefixtures("grasped")
 def test_finished_trials_are_shown_if_a_later_one_fails(
     run: Run, port_options: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "stdin", Terminal("\n", ""))  # Ctrl-D
     done = run("grasp", "--trials", 2, "--object", "cup", *port_options)
     assert done.code == 2
-    assert done.out.count("cup") == 1
+    assert done.out.count(" held ") == 1
     assert "no answer to this: Put the cup between the jaws for trial 2 of 2" in done.err
 
 
-def test_without_a_terminal_trials_do_not_wait(run: Run, port_options: list[str], tmp_path: Path) -> None:
-    done = run("grasp", "--json", "--trials", 2, "--target-n", 3, *port_options)
-    assert [trial["result"] for trial in done.json()["trials"]] == ["held", "held"]
+@pytest.mark.usefixtures("grasped")
+def test_finished_trials_are_shown_after_an_interrupt(
+    run: Run, port_options: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("\n", "Ctrl-C"))
+    done = run("grasp", "--trials", 3, "--json", *port_options)
+    result = json.loads(done.out)
+    assert (done.code, len(result["trials"]), result["summary"]["trials"]) == (130, 1, 1)
+
+
+@pytest.mark.usefixtures("grasped")
+def test_without_a_terminal_trials_do_not_wait(run: Run, port_options: list[str]) -> None:
+    done = run("grasp", "--json", "--trials", 2, *port_options)
+    assert [trial["object"] for trial in done.json()["trials"]] == ["mug", "mug"]
     assert "without a pause" in done.err
-    assert done.json()["summary"]["good_percent"] is None
-    assert len(list((tmp_path / "runs").glob("*-mug-3N-*.mcap"))) == 2
 
 
-def test_replay_prints_one_json_object(run: Run, fused_log: Path) -> None:
+def test_replay_prints_one_json_object(run: Run, fused_log: Path, current_log: Path) -> None:
     result = run("replay", fused_log, "--json").json()
     assert set(result) >= ERROR_KEYS | {"identical"}
     assert result["identical"] is True
-    table = run("replay", fused_log)
+    table = run("replay", current_log)
     assert table.code == 0
     assert "yes, bit for bit" in table.out
-    changed = run("replay", fused_log, "--set", "control.ramp_n_s=4", "--json").json()
+    assert "open loop" not in table.err
+    changed = run("replay", current_log, "--set", "control.ramp_n_s=4", "--json").json()
     assert changed["identical"] is False
 
 
@@ -498,15 +530,25 @@ SUCCESSES = [
     "config check",
     "config schema",
     "config file",
-    "calibrate jaws --yes --set object=none --set sim.detail=coarse",
-    "export network {checkpoint} --out force.xml",
 ]
-"""Commands of each group; those of `import`, and others, have tests of their own."""
+"""Commands of one group; those of others have tests of their own."""
 
 
 @pytest.mark.parametrize("command", SUCCESSES)
-def test_with_json_a_result_is_one_object(run: Run, command: str, tiny_checkpoint: Path) -> None:
-    assert run(*command.format(checkpoint=tiny_checkpoint).split(), "--json").json()
+def test_with_json_a_result_is_one_object(run: Run, command: str) -> None:
+    assert run(*command.split(), "--json").json()
+
+
+def test_an_export_states_its_error_and_the_next_step(
+    run: Run, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = {"largest_n": 2e-4, "mean_n": 1e-4, "rms_n": 1.5e-4}
+    monkeypatch.setattr("gripper_force.vision.export.export", lambda model, path: errors)
+    done = run("export", "network", tiny_checkpoint, "--out", "force.xml", "--json")
+    found = done.json()
+    assert (found["file"], found["off_torch_n"]) == ("force.xml", errors)
+    options = "--set vision.checkpoint=force.xml --set vision.engine=openvino"
+    assert done.err.splitlines()[-1] == f"next: gripper-force grasp {options}"
 
 
 def test_with_json_the_error_is_json_too(run: Run) -> None:
@@ -540,31 +582,27 @@ def test_a_file_that_is_no_checkpoint_is_named(
     save_file(load_file(tiny_checkpoint), foreign)
     short.write_bytes(tiny_checkpoint.read_bytes()[:-100])
     for path, sentence in ((garbage, "damaged"), (foreign, "is not a gripper-force"), (short, "damaged")):
-        done = run("replay", fused_log, "--checkpoint", path)
+        done = run("replay", fused_log, "--checkpoint", path, "--set", "vision.engine=torch")
         assert done.code == 2
         (line,) = done.err.splitlines()
         assert str(path) in line
         assert sentence in line
 
 
-def test_a_report_can_be_that_of_a_replay(run: Run, fused_log: Path, tmp_path: Path) -> None:
-    log = Path(shutil.copy(fused_log, tmp_path / "run.mcap"))
+def test_a_report_can_be_that_of_a_replay(run: Run, current_log: Path, tmp_path: Path) -> None:
+    log = Path(shutil.copy(current_log, tmp_path / "run.mcap"))
     done = run("replay", log, "--report", "--set", "control.ramp_n_s=4", "--json")
     page = Path(done.json()["report"])
     assert page.name == "run-replayed.html"
     assert "replayed with changes, open loop" in page.read_text(encoding="utf-8")
     assert "A replay is open loop" in done.err
-    as_it_was = run("replay", log, "--report", "--json")
-    assert Path(as_it_was.json()["report"]).name == "run.html"
-    assert "open loop" not in as_it_was.err
-    assert "open loop" not in (tmp_path / "run.html").read_text(encoding="utf-8")
 
 
 def test_a_folder_is_replayed(
-    run: Run, fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, current_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("a", "b"):
-        shutil.copy(fused_log, tmp_path / f"{name}.mcap")
+        shutil.copy(current_log, tmp_path / f"{name}.mcap")
     found = run("replay", tmp_path, "--json", "--jobs", 1).json()
     assert [Path(log["log"]).stem for log in found["logs"]] == ["a", "b"]
     assert found["summary"]["identical"] == found["summary"]["logs"] == 2
@@ -580,84 +618,103 @@ def test_a_folder_is_replayed(
     assert long.name in names  # a terminal of 80 columns cuts nothing off
 
 
-def test_two_settings_are_compared(run: Run, fused_log: Path, tmp_path: Path, tiny_checkpoint: Path) -> None:
-    for name in ("a", "b"):
-        shutil.copy(fused_log, tmp_path / f"{name}.mcap")
-    same = run("replay", tmp_path, "--compare", "log", tiny_checkpoint, "--json", "--jobs", 1).json()
+def test_two_settings_are_compared(
+    run: Run, fused_log: Path, current_log: Path, tmp_path: Path, tiny_checkpoint: Path
+) -> None:
+    same = run("replay", fused_log, "--compare", "log", tiny_checkpoint, "--json").json()
     assert same["differences"]["visual"]["difference_n"] == 0
-    done = run("replay", tmp_path, "--compare", "log", "control.feedback=current", "--jobs", 1)
+    for name in ("a", "b"):
+        shutil.copy(current_log, tmp_path / f"{name}.mcap")
+    done = run("replay", tmp_path, "--compare", "log", "control.ramp_n_s=4", "--jobs", 1)
     assert "95 % interval" in done.out
     assert "A replay is open loop" in done.err
     wrong = run("replay", tmp_path, "--compare", "log", "log", "--report")
     assert (wrong.code, "--compare names its checkpoints" in wrong.err) == (2, True)
 
 
-def interrupt(arguments: list[str], folder: Path) -> tuple[int, str]:
-    """Runs the command in a terminal's group of its own, and sends Ctrl-C once it writes a log."""
-    command = [sys.executable, "-c", "from gripper_force.cli import main; main()", *arguments]
-    with subprocess.Popen(
-        command, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as child:
-        while not any(log.stat().st_size > 100_000 for log in folder.rglob("*.mcap")):
-            assert child.poll() is None
-            time.sleep(0.01)
-        os.killpg(child.pid, signal.SIGINT)
-        _, said = child.communicate()
-    return child.returncode, said
+def interrupt(
+    arguments: list[str], folder: Path, is_time: Callable[[], bool], to: str = "group"
+) -> tuple[int, str]:
+    """Runs the command, sends Ctrl-C when it is time, and waits for the end of all its processes.
 
+    Args:
+        arguments: The command.
+        folder: Its folder.
+        is_time: Called again and again from when the command line has been imported.
+        to: Receiver: the "group", as with a terminal, or the "command" alone.
 
-def test_an_interrupted_grasp_says_where_its_log_is(sets: list[str], tmp_path: Path) -> None:
-    more = ["--set", "control.hold_s=600", "--set", f"log.directory={tmp_path}/my runs"]
-    code, said = interrupt(["grasp", *sets, *more], tmp_path)
-    assert (code, "Traceback" in said) == (130, False)
-    (log,) = tmp_path.rglob("*.mcap")
-    assert f"gripper-force replay '{log}'" in said  # as a shell takes it
-    assert LogReader(log).duration_ns > 0
-
-
-def test_interrupted_trials_end_without_a_word_from_each_process(sets: list[str], tmp_path: Path) -> None:
-    code, said = interrupt(["grasp", "--trials", "40", "--jobs", "2", *sets], tmp_path)
-    assert (code, "Traceback" in said) == (130, False)
-    assert "interrupted" in said
-
-
-@pytest.mark.parametrize(
-    ("name", "to", "delay_s"),
-    [
-        ("grasp", "group", 0.3),
-        ("grasp", "command", 4.0),
-        ("simulate", "group", 5.0),
-        ("simulate", "command", 1.5),
-    ],
-)
-def test_an_interrupt_at_any_time_ends_a_command_and_its_processes(
-    name: str, to: str, delay_s: float, sets: list[str], tmp_path: Path
-) -> None:
+    Returns:
+        Exit code and stderr.
+    """
     program = (
         "import sys; from gripper_force.cli import main; print('ready', file=sys.stderr, flush=True); main()"
     )
-    options = {"grasp": ("--trials", "400", *sets), "simulate": ("--presses", "400")}
-    command = [sys.executable, "-c", program, name, "--json", *options[name], "--jobs", "2"]
     with subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
+        [sys.executable, "-c", program, *arguments],
+        cwd=folder,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     ) as child:
         assert child.stderr is not None
         assert child.stderr.readline() == "ready\n"
-        time.sleep(delay_s)
-        if to == "group":  # as a terminal does
+        while not is_time():
+            assert child.poll() is None
+            time.sleep(0.01)
+        if to == "group":
             os.killpg(child.pid, signal.SIGINT)
         else:
             child.send_signal(signal.SIGINT)
-        out, said = child.communicate(timeout=60)  # until no process holds the pipes
-    assert (child.returncode, "Traceback" in said) == (130, False), said
-    if out:
-        result = json.loads(out)
-        assert result["summary"]["trials"] == len(result["trials"]) > 0
+        _, said = child.communicate(timeout=60)  # until no process holds the pipe
+    return child.returncode, said
+
+
+def after(delay_s: float) -> Callable[[], bool]:
+    """Returns a condition that holds from this time after its first call."""
+    begins_s: list[float] = []
+
+    def is_time() -> bool:
+        begins_s.append(time.monotonic())
+        return begins_s[-1] - begins_s[0] >= delay_s
+
+    return is_time
+
+
+def test_an_interrupted_grasp_says_where_its_log_is(sets: list[str], tmp_path: Path) -> None:
+    more = ["--set", "control.hold_s=600", "--set", f"log.directory={tmp_path}/my runs"]
+
+    def is_written() -> bool:
+        return any(log.stat().st_size > 100_000 for log in tmp_path.rglob("*.mcap"))
+
+    code, said = interrupt(["grasp", *sets, *more], tmp_path, is_written)
+    assert (code, "Traceback" in said) == (130, False)
+    (log,) = tmp_path.rglob("*.mcap")
+    assert f"gripper-force replay '{log}'" in said  # as a shell takes it
+    assert LogReader(log).duration_ns > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "moment", "to"),
+    [
+        ("grasp", "imports", "group"),
+        ("grasp", "a log", "command"),
+        ("simulate", "a log", "group"),
+        ("simulate", "the start of processes", "command"),
+    ],
+)
+def test_an_interrupt_at_any_time_ends_a_command_and_its_processes(
+    name: str, moment: str, to: str, sets: list[str], tmp_path: Path
+) -> None:
+    is_time = {
+        "imports": after(0.3),
+        "a log": lambda: any(tmp_path.rglob("*.mcap*")),
+        "the start of processes": after(1.5),
+    }[moment]
+    cheap = ("--set", "sim.detail=coarse", "--set", "camera.backend=none")
+    options = {"grasp": ("--trials", "400", *sets), "simulate": ("--presses", "400", *cheap)}
+    code, said = interrupt([name, *options[name], "--jobs", "2"], tmp_path, is_time, to)
+    assert (code, "Traceback" in said) == (130, False), said
+    assert said.count("interrupted") == 1
 
 
 def test_an_interrupt_that_became_another_error_is_an_interrupt(
@@ -670,13 +727,8 @@ def test_an_interrupt_that_became_another_error_is_an_interrupt(
         except KeyboardInterrupt as interrupt:
             raise ValueError("error in a callback") from interrupt
 
-    handler = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(process, "_received", [])
     monkeypatch.setattr("gripper_force.jobs.grasp.run_grasp", converted)
-    try:
-        done = run("grasp")
-    finally:
-        signal.signal(signal.SIGINT, handler)
+    done = run("grasp")
     assert done.code == 130
     assert "interrupted" in done.err
 
@@ -708,9 +760,10 @@ def test_what_a_simulation_would_not_heed_is_an_error(
 
 def test_logs_can_be_made_of_one_object(run: Run, tmp_path: Path) -> None:
     call = "--presses 0 --taps 1 --grasps 0 --jobs 1 --first-seed 100007 --set sim.detail=coarse"
-    options = call.split()
-    made = run("simulate", "--out", tmp_path / "hard", "--object", "stapler", *options, "--json")
+    options = f"{call} --set camera.backend=none".split()
+    made = run("simulate", "--out", "hard", "--object", "stapler", *options, "--json")
     assert made.json()["made"] == 1
+    assert made.err.splitlines()[-1] == "next: gripper-force train hard --out force.safetensors"
     assert [path.name for path in (tmp_path / "hard").iterdir()] == ["tap-stapler-100007.mcap"]
     unknown = run("simulate", "--out", tmp_path / "none", "--object", "pencil", *options)
     assert (unknown.code, "no simulated object 'pencil'" in unknown.err) == (2, True)
@@ -878,17 +931,24 @@ def test_only_a_command_with_a_run_says_that_it_was_stopped(
     def end() -> None:
         raise KeyboardInterrupt
 
-    handlers = {number: signal.getsignal(number) for number in process.SIGNALS}
     monkeypatch.setattr("gripper_force.config.load_with_options", interrupted)
-    try:
-        for words in (["grasp"], ["calibrate", "jaws"], ["bench", "gain"], ["doctor"]):
-            done = run(*words)
-            assert done.code == 130
-            said = done.err.splitlines()[-1]
-            assert said == "interrupted" + ("; the run was stopped as configured" if in_run else ""), words
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    for words in (["grasp"], ["calibrate", "jaws"], ["bench", "gain"], ["doctor"]):
+        done = run(*words)
+        assert done.code == 130
+        said = done.err.splitlines()[-1]
+        assert said == "interrupted" + ("; the run was stopped as configured" if in_run else ""), words
+
+
+@pytest.mark.parametrize(("options", "same"), [([], ""), (["--fresh"], " without --fresh")])
+def test_the_command_that_continues_an_interrupted_teaching_starts_nothing_over(
+    run: Run, options: list[str], same: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("Ctrl-C"))
+    words = ["teach", "stapler", "--pause", "--out", "bundle", "--set", "vision.checkpoint=small"]
+    done = run(*words, *options)
+    assert done.code == 130
+    assert "then press Enter" in done.err
+    assert f"is in data/touches/stapler; the same command{same} continues there" in done.err
 
 
 def test_a_virtual_servo_has_one_id(run: Run) -> None:
@@ -939,32 +999,30 @@ def test_a_setting_that_a_camera_lacks_is_not_shown(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize(("result", "told"), [("timeout", True), ("held", False)])
 def test_a_grasp_that_was_not_held_says_why(
-    fused_log: Path, capsys: pytest.CaptureFixture[str], result: str, told: bool
+    current_log: Path, capsys: pytest.CaptureFixture[str], result: str, told: bool
 ) -> None:
-    summary = summarise_grasp(fused_log)
+    summary = summarise_grasp(current_log)
     summary["result"], summary["reason"] = result, "not held within 8 s: the camera sees 0.0 N"
     grasp_table(summary)
     assert (summary["reason"] in capsys.readouterr().out) == told
 
 
-@pytest.fixture(scope="module")
-def measured_once() -> Iterator[None]:
-    """The gauge is pressed once for the tests of what `calibrate servo` writes where."""
-    found: list[Any] = []
+@pytest.fixture
+def servo_calibrated(monkeypatch: pytest.MonkeyPatch, servo_calibration: ServoCalibration) -> None:
+    """`calibrate servo` presses no gauge, and writes a calibration all the same."""
+    value = CalibratedValue(value=1.0)
 
-    def once(*arguments: Any) -> Any:
-        found[:] = found or [measure(*arguments)]
-        return found[0]
+    def calibrate(_config: Config, _gauges_m: list[float], rig: Path, **_: object) -> ServoResult:
+        update_rig(rig, servo_calibration)
+        return ServoResult(servo_calibration, value, value, value, value, value, 6, 12, 0.0, rig, rig)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calibrate_servo, "measure", once)
-        yield
+    monkeypatch.setattr(calibrate_servo, "calibrate_servo", calibrate)
 
 
-@pytest.mark.usefixtures("measured_once")
+@pytest.mark.usefixtures("servo_calibrated")
 def test_a_calibration_does_not_write_its_rig_profile_over_the_rig_file_of_setup(run: Run) -> None:
     rig = Path("rig.yaml")
-    rig.write_text("object: block\nsim: {detail: coarse}\n")
+    rig.write_text("object: block\n")
     text = rig.read_text()
     done = run("calibrate", "servo", "--gauge-mm", "30", "--yes", "--config", "rig.yaml")
     assert done.code == 0, done.err
@@ -972,19 +1030,24 @@ def test_a_calibration_does_not_write_its_rig_profile_over_the_rig_file_of_setup
     assert (rig.read_text(), Path("rig_profile.yaml").exists()) == (text, True)
 
 
-@pytest.mark.usefixtures("measured_once")
+@pytest.mark.usefixtures("servo_calibrated")
 def test_a_calibration_replaces_a_damaged_rig_profile_of_its_file(run: Run) -> None:
     Path("old.yaml").write_text("format: gripper-force-rig/0")
-    Path("my.yaml").write_text("object: block\nsim: {detail: coarse}\ncalibration: {rig: old.yaml}\n")
+    Path("my.yaml").write_text("object: block\ncalibration: {rig: old.yaml}\n")
     options = ("--config", "my.yaml", "--set", "calibration.rig=new.yaml", "--json")
     done = run("calibrate", "servo", "--gauge-mm", "30", "--yes", *options)
     assert done.code == 0, done.err
     assert "next:" in done.err
     assert "calibration.rig=new.yaml" in done.err
     assert "nm_per_a" in json.loads(done.out)
+    assert Path("new.yaml").exists()
 
 
-def test_commands_before_the_first_calibration_need_no_rig_profile(run: Run) -> None:
+def test_commands_before_the_first_calibration_need_no_rig_profile(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jaws = JawsResult(0.0, 2.0, 0.01, (1.0, 1.0), (1.0, 1.0), 1, 0.0, 0.09, 1.0)
+    monkeypatch.setattr(calibrate_jaws, "calibrate_jaws", lambda *_, **__: jaws)
     new = ("--set", "calibration.rig=rig.yaml", "--set", "object=none", "--set", "sim.detail=coarse")
     assert "closing_sign: 1" in run("calibrate", "jaws", "--yes", *new).out
     checked = run("doctor", *new, "--set", "camera.backend=none", "--set", "vision.checkpoint=none")
@@ -996,12 +1059,12 @@ def test_commands_before_the_first_calibration_need_no_rig_profile(run: Run) -> 
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "run"])
-def test_a_view_is_not_saved_over_a_log(run: Run, fused_log: Path, name: str) -> None:
+def test_a_view_is_not_saved_over_a_log(run: Run, current_log: Path, name: str) -> None:
     log = Path("run.mcap")
-    log.write_bytes(fused_log.read_bytes())
+    log.write_bytes(current_log.read_bytes())
     done = run("view", log, "--save", name)
     assert (done.code, "name one that ends with .rrd" in done.err) == (2, True)
-    assert log.read_bytes() == fused_log.read_bytes()
+    assert log.read_bytes() == current_log.read_bytes()
 
 
 def test_a_folder_of_videos_takes_neither_an_object_nor_a_table(run: Run, tmp_path: Path) -> None:
@@ -1010,37 +1073,37 @@ def test_a_folder_of_videos_takes_neither_an_object_nor_a_table(run: Run, tmp_pa
         assert (done.code, f"leave out {more[0]}" in done.err) == (2, True)
 
 
-def test_names_are_shown_as_they_are(run: Run, fused_log: Path) -> None:
+def test_names_are_shown_as_they_are(run: Run, current_log: Path) -> None:
     named = Path("[red] [b].mcap")
-    named.write_bytes(fused_log.read_bytes())
-    done = run("replay", named, fused_log, "--jobs", "1")
+    named.write_bytes(current_log.read_bytes())
+    done = run("replay", named, current_log, "--jobs", "1")
     assert (done.code, "[red] [b].mcap" in done.out) == (0, True)
 
 
-def test_a_log_given_twice_is_replayed_once(run: Run, fused_log: Path) -> None:
-    Path("run.mcap").write_bytes(fused_log.read_bytes())
+def test_a_log_given_twice_is_replayed_once(run: Run, current_log: Path) -> None:
+    Path("run.mcap").write_bytes(current_log.read_bytes())
     done = run("replay", "run.mcap", ".", Path("run.mcap").resolve(), "--json")
     assert json.loads(done.out)["log"] == "run.mcap", "one result, not a list"
 
 
-def test_a_summary_that_cannot_be_written_gives_one_json_object(run: Run, fused_log: Path) -> None:
+def test_a_summary_that_cannot_be_written_gives_one_json_object(run: Run, current_log: Path) -> None:
     Path("out/summary.csv").mkdir(parents=True)
     for more in ([], ["--compare", "log", "control.ramp_n_s=4"]):
-        done = run("replay", fused_log, "--out", "out", "--json", "--jobs", "1", *more)
+        done = run("replay", current_log, "--out", "out", "--json", "--jobs", "1", *more)
         assert (done.code, list(json.loads(done.out))) == (2, ["error"])
 
 
-def test_a_comparison_goes_on_without_a_broken_first_log(run: Run, fused_log: Path) -> None:
-    Path("a.mcap").write_bytes(fused_log.read_bytes()[:5000])
-    Path("b.mcap").write_bytes(fused_log.read_bytes())
+def test_a_comparison_goes_on_without_a_broken_first_log(run: Run, current_log: Path) -> None:
+    Path("a.mcap").write_bytes(current_log.read_bytes()[:5000])
+    Path("b.mcap").write_bytes(current_log.read_bytes())
     done = run("replay", ".", "--compare", "log", "control.ramp_n_s=4", "--json", "--jobs", "1")
     found = json.loads(done.out)
     assert (done.code, found["logs"], list(found["failed"])) == (2, 1, ["a.mcap"])
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="macOS has no such file names")
-def test_a_summary_names_a_file_whose_name_is_no_text(run: Run, fused_log: Path) -> None:
-    Path(os.fsdecode(b"a\xff.mcap")).write_bytes(fused_log.read_bytes())
+def test_a_summary_names_a_file_whose_name_is_no_text(run: Run, current_log: Path) -> None:
+    Path(os.fsdecode(b"a\xff.mcap")).write_bytes(current_log.read_bytes())
     done = run("replay", ".", "--out", "out", "--jobs", "1")
     assert done.code == 0, done.err
     assert "a\\udcff.mcap" in Path("out/summary.html").read_text()

@@ -11,31 +11,54 @@ import termios
 from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
-TAP = "simulate --presses 0 --grasps 0 --taps 1 --object stapler --set sim.detail=coarse --jobs 1"
+IMPORT = "import database db --out logs"
 _AGAIN_S = 2.0
 """Silence after which keys are pressed again: Python misses an interrupt just before it begins to read the terminal."""
 
 ESCAPE = re.compile(r"\x1b")
 COLOUR = re.compile(r"\x1b\[[0-9;]*\b([349]|10)[0-8](;[0-9;]*)?m")
-CALLS = {
-    "a bar": (TAP, 0),
-    "a table": ("config file", 0),
-    "an error": ("grasp --set no.such=1", 2),
-    "help": ("--help", 0),
+SHOWING = {
+    "a bar": IMPORT,
+    "a table": "config file",
+    "an error": "config show --set no.such=1",
+    "help": "--help",
 }
+EACH = """
+import sys
+from gripper_force.cli import main
+for line in sys.argv[1:]:
+    sys.argv[1:] = line.split()
+    try:
+        main()
+    except SystemExit as end:
+        print(f"code {end.code}", flush=True)
+"""
+"""Runs several commands: to start a process for each would take most of the time."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a database of one environment."""
+    environment = tmp_path / "db" / "sponge_30_100"
+    environment.mkdir(parents=True)
+    (environment / "test.txt").write_text("".join(f"{number},0.0,0\n" for number in range(1, 5)))
+    for number in range(1, 5):
+        cv2.imwrite(str(environment / f"{number}.jpg"), np.zeros((16, 16, 3), np.uint8))
+    return tmp_path
 
 
 def on_terminal(
-    arguments: str, folder: Path, keys: Mapping[str, bytes] | None = None, **variables: str
+    command: list[str], folder: Path, keys: Mapping[str, bytes] | None = None, **variables: str
 ) -> tuple[int, str]:
-    """Runs the command in a terminal, and presses keys once it shows a text. Returns exit code and what it showed."""
+    """Runs a command in a terminal, and presses keys once it shows a text. Returns exit code and what it showed."""
     left, pressed = dict(keys or {}), b""
     env = {key: value for key, value in os.environ.items() if key not in ("NO_COLOR", "FORCE_COLOR", "TERM")}
     master, slave = os.openpty()
-    command = [*COMMAND, *arguments.split()]
     with subprocess.Popen(
         command,
         cwd=folder,
@@ -74,23 +97,30 @@ def _read(master: int) -> bytes:
         return b""
 
 
-@pytest.mark.parametrize(("arguments", "code"), CALLS.values(), ids=CALLS)
-def test_a_dumb_terminal_gets_no_escape_codes(arguments: str, code: int, tmp_path: Path) -> None:
-    done, shown = on_terminal(arguments, tmp_path, TERM="dumb")
-    assert (done, ESCAPE.search(shown)) == (code, None)
-    assert shown
+def each_on_terminal(folder: Path, **variables: str) -> dict[str, str]:
+    """Runs the commands of `SHOWING` in a terminal, and returns what they showed."""
+    _, shown = on_terminal([sys.executable, "-c", EACH, *SHOWING.values()], folder, None, **variables)
+    *parts, rest = re.split(r"code (\d)\r?\n", shown)
+    assert (parts[1::2], rest) == (["0", "0", "2", "0"], ""), shown
+    return dict(zip(SHOWING, parts[::2], strict=True))
 
 
-@pytest.mark.parametrize("name", ["a bar", "an error", "help"])
-def test_there_is_colour_unless_no_color_is_set(name: str, tmp_path: Path) -> None:
-    (arguments, code), term = CALLS[name], "xterm-256color"
-    done, shown = on_terminal(arguments, tmp_path, TERM=term)
-    assert (done, COLOUR.search(shown) is not None) == (code, True)
-    done, shown = on_terminal(arguments, tmp_path, TERM=term, NO_COLOR="1")
-    assert (done, COLOUR.search(shown)) == (code, None)
+def test_a_dumb_terminal_gets_no_escape_codes(folder: Path) -> None:
+    for name, shown in each_on_terminal(folder, TERM="dumb").items():
+        assert shown, name
+        assert not ESCAPE.search(shown), name
 
 
-@pytest.mark.parametrize("arguments", ["config show", "config show --json", "config file"])
+def test_there_is_colour_unless_no_color_is_set(folder: Path) -> None:
+    def coloured(**variables: str) -> list[str]:
+        shown = each_on_terminal(folder, TERM="xterm-256color", **variables)
+        return [name for name, text in shown.items() if COLOUR.search(text)]
+
+    assert coloured() == ["a bar", "an error", "help"]
+    assert coloured(NO_COLOR="1") == []
+
+
+@pytest.mark.parametrize("arguments", ["config show --json", "config file"])
 def test_an_output_on_a_full_disk_is_one_sentence(arguments: str, tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -110,41 +140,31 @@ def test_an_output_that_nobody_reads_is_no_error(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "")
 
 
-def test_without_a_terminal_a_bar_is_printed_once(tmp_path: Path) -> None:
-    done = subprocess.run([*COMMAND, *TAP.split()], cwd=tmp_path, capture_output=True, text=True, check=True)
+def test_without_a_terminal_a_bar_is_printed_once(folder: Path) -> None:
+    done = subprocess.run([*COMMAND, *IMPORT.split()], cwd=folder, capture_output=True, text=True, check=True)
     assert "\r" not in done.stdout + done.stderr
     assert not ESCAPE.search(done.stdout + done.stderr)
-    assert done.stderr.count("simulating ") == 1
+    assert done.stderr.count("importing ") == 1
     assert " 1/1 " in done.stderr
-    assert done.stderr.splitlines()[-1] == "next: gripper-force train data/sim --out force.safetensors"
-    assert "logs" in done.stdout
+    assert done.stderr.splitlines()[-1] == "next: gripper-force evaluate logs"
+    assert "sponge_30_100" in done.stdout
 
 
 @pytest.mark.parametrize(
     ("arguments", "question"),
     [
         ("setup", "Write it (EEPROM)? "),
-        ("setup --step jaws", "Pitch radius of the pinion in mm"),
         ("doctor --setup", "Write these to servo 1? "),
     ],
-    ids=["a question of setup", "a number for setup", "the question of doctor"],
+    ids=["setup", "doctor"],
 )
 def test_ctrl_c_at_a_question_ends_with_130(arguments: str, question: str, tmp_path: Path) -> None:
     options = "--set servo.port=virtual:asked --set load_cell.backend=none --set camera.backend=none"
-    code, shown = on_terminal(f"{arguments} {options}", tmp_path, keys={question: b"\x03"}, TERM="dumb")
+    command = [*COMMAND, *arguments.split(), *options.split()]
+    code, shown = on_terminal(command, tmp_path, keys={question: b"\x03"}, TERM="dumb")
     assert code == 130
     assert shown.splitlines()[-1].split(";")[0] == "interrupted"
     assert ("what was found so far is in rig.yaml" in shown) == (arguments == "setup")
-
-
-@pytest.mark.parametrize(("option", "same"), [("", ""), (" --fresh", " without --fresh")])
-def test_the_command_that_continues_an_interrupted_teaching_starts_nothing_over(
-    option: str, same: str, tmp_path: Path
-) -> None:
-    arguments = "teach stapler --touches 4 --pause --set vision.checkpoint=small --out bundle" + option
-    code, shown = on_terminal(arguments, tmp_path, keys={"press Enter": b"\x03"}, TERM="dumb")
-    assert code == 130
-    assert f"is in data/touches/stapler; the same command{same} continues there" in shown
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])

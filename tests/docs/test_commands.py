@@ -85,7 +85,7 @@ SENTENCES = [line for page in PAGES for line in inline_commands(page)]
 def recorder() -> tuple[Any, list[Call]]:
     """The command line, whose commands note their call instead of running, and the notes. Making it takes time."""
     calls: list[Call] = []
-    root: Any = typer.main.get_command(cli.app)
+    root: Any = typer.main.get_group(cli.app)  # of its own: it is changed
 
     def record(command: Any, name: str) -> None:
         if hasattr(command, "commands"):
