@@ -1,9 +1,9 @@
 """Candidate corrections of one object: none, a line, curves, and a line with the last layer refitted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
-from gripper_calibration.fits.output_curve import BENDS, fit_curve, fit_line, identity
+from gripper_calibration.fits.output_curve import BENDS, CurveProblem, LineEvidence, fit_line, identity
 from gripper_calibration.fits.ridge import PENALTIES, Ridge
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.profiles.object_profile import OutputCurve
@@ -43,7 +43,10 @@ class FittedCandidate(NamedTuple):
 
 
 def fit_candidates(
-    touches: Touches, candidates: Sequence[Candidate], max_frames: int
+    touches: Touches,
+    candidates: Sequence[Candidate],
+    max_frames: int,
+    evidence: Mapping[int, LineEvidence] | None = None,
 ) -> Iterator[FittedCandidate]:
     """Fits candidates to touches.
 
@@ -51,20 +54,23 @@ def fit_candidates(
         touches: One or more touches.
         candidates: The candidates.
         max_frames: Frames for a refit of the last layer, whose cost is cubic.
+        evidence: `line_evidence` of these touches, and perhaps of others, if it is known.
 
     Yields:
         The fit of each candidate.
     """
-    line = fit_line(touches)
+    line = fit_line(touches, evidence)
     max_estimate_n = float(touches.estimate_n.max())
     ridge: Ridge | None = None
+    problem: CurveProblem | None = None
     for candidate in candidates:
         if candidate.curve == "identity":
             output = identity(max_estimate_n)
         elif candidate.curve == "affine":
             output = line.curve(max_estimate_n)
         else:
-            output = fit_curve(touches, line, float(candidate.curve))
+            problem = problem or CurveProblem(touches, line)
+            output = problem.solve(float(candidate.curve))
         if candidate.penalty is None:
             yield FittedCandidate(output, None, 0.0)
             continue

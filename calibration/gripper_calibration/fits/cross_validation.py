@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from gripper_calibration.fits.candidates import AS_IT_IS, CANDIDATES, LINE, Candidate, fit_candidates
 from gripper_calibration.fits.interval_fit import MIN_TOUCHES, touch_interval
+from gripper_calibration.fits.output_curve import LineEvidence, line_evidence
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.jobs.dataset import CONTACT_N
 
@@ -76,13 +77,14 @@ def cross_validate(touches: Touches, coverage: float) -> CrossValidation:
     numbers = touches.numbers
     count = len(numbers)
     parts = [touches.only([number]) for number in numbers]
+    evidence = line_evidence(touches)  # the same in all fits
     # The estimates of touch i by fits without i and j, by (i, j); of touch i by fits without i, by (i, i).
     estimates_n: dict[tuple[int, int], Floats] = {}  # (candidates, N_i) each
     for i in range(count):
-        estimates_n[i, i] = _estimates_n(touches.without([numbers[i]]), parts[i])
+        estimates_n[i, i] = _estimates_n(touches.without([numbers[i]]), evidence, parts[i])
     nested = count > MIN_TOUCHES
     for i, j in combinations(range(count), 2) if nested else ():
-        both_n = _estimates_n(touches.without([numbers[i], numbers[j]]), parts[i], parts[j])
+        both_n = _estimates_n(touches.without([numbers[i], numbers[j]]), evidence, parts[i], parts[j])
         estimates_n[i, j], estimates_n[j, i] = np.split(both_n, [len(parts[i].touch)], axis=1)
 
     measured = [Measured(part.force_n, part.touch) for part in parts]
@@ -197,7 +199,7 @@ def select_simplest(error_n: Floats) -> int:
     return int(np.argmax(excess_n.mean(0) <= standard_error_n))
 
 
-def _estimates_n(others: Touches, *left_out: Touches) -> Floats:
+def _estimates_n(others: Touches, evidence: Mapping[int, LineEvidence], *left_out: Touches) -> Floats:
     """Returns the estimates of all candidates, fitted to ``others``, for left-out touches, (candidates, N)."""
-    fits = list(fit_candidates(others, CANDIDATES, _MAX_FRAMES))
+    fits = list(fit_candidates(others, CANDIDATES, _MAX_FRAMES, evidence))
     return np.stack([np.concatenate([fit.predict(part) for part in left_out]) for fit in fits])

@@ -13,8 +13,9 @@ doi:10.1214/aoms/1177703732).
 line's slope draws it to the line.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -83,36 +84,67 @@ class LinearFit:
         )
 
 
-def fit_line(touches: Touches) -> LinearFit:
-    """Fits the line. One touch is enough; the prior then limits its effect."""
-    parts = [touches.only([number]) for number in touches.numbers]
-    designs = [np.column_stack([part.estimate_n, np.ones(len(part.estimate_n))]) for part in parts]
-    residuals = [part.force_n - part.estimate_n for part in parts]
-    weights = [_huber_weights(x, r) for x, r in zip(designs, residuals, strict=True)]
-    frame_std_n = max(_frame_std_n(designs, residuals, weights), _MIN_STD_N)
+class LineEvidence(NamedTuple):
+    """Robust fit of a line to one touch alone: all that a fit to several touches needs of it.
+
+    Attributes:
+        gram: Weighted products of estimate and 1, (2, 2).
+        moment: Their weighted products with force less estimate, (2,).
+        square: Weighted sum of the squared residuals.
+        frames: Sum of the frames' weights.
+    """
+
+    gram: Floats
+    moment: Floats
+    square: float
+    frames: float
+
+
+def line_evidence(touches: Touches) -> dict[int, LineEvidence]:
+    """Returns the evidence of each touch, by its number."""
+    return {number: _evidence(touches.only([number])) for number in touches.numbers}
+
+
+def _evidence(touch: Touches) -> LineEvidence:
+    design = np.column_stack([touch.estimate_n, np.ones(len(touch.estimate_n))])
+    target = touch.force_n - touch.estimate_n
+    weights = _huber_weights(design, target)
+    root = np.sqrt(weights)
+    fit = np.linalg.lstsq(design * root[:, None], target * root, rcond=None)[0]
+    weighted = (design * weights[:, None]).T
+    square = float(weights @ np.square(target - design @ fit))
+    return LineEvidence(weighted @ design, weighted @ target, square, float(weights.sum()))
+
+
+def fit_line(touches: Touches, evidence: Mapping[int, LineEvidence] | None = None) -> LinearFit:
+    """Fits the line. One touch is enough; the prior then limits its effect.
+
+    Args:
+        touches: One or more touches.
+        evidence: `line_evidence` of these touches, and perhaps of others, if it is known.
+    """
+    known = line_evidence(touches) if evidence is None else evidence
+    gram, moment, square, frames = zip(*(known[number] for number in touches.numbers), strict=True)
+    count = len(gram)
+    frame_std_n = max(float(np.sqrt(sum(square) / sum(frames))), _MIN_STD_N)
     scale = 1 / (_FRAMES_PER_DRAW * frame_std_n**2)
-    grams = [scale * (x * w[:, None]).T @ x for x, w in zip(designs, weights, strict=True)]  # (2, 2) each
-    moments = [scale * (x * w[:, None]).T @ r for x, r, w in zip(designs, residuals, weights, strict=True)]
+    grams, moments = scale * np.stack(gram), scale * np.stack(moment)  # (K, 2, 2), (K, 2)
     gain_weight = 0.0  # the first iteration is without the gain's prior
     touch_var = np.square([_TOUCH_GAIN_STD, _TOUCH_OFFSET_STD_N])
     unit = np.eye(2)
     for _ in range(_ITERATIONS):
-        shrinkage = [np.linalg.inv(unit + gram * touch_var) for gram in grams]
+        shrinkage = np.linalg.inv(unit + grams * touch_var)
         prior = np.diag([gain_weight * GAIN_STD**-2, OFFSET_STD_N**-2])
-        precision = prior + sum(s @ g for s, g in zip(shrinkage, grams, strict=True))
-        line = np.linalg.solve(precision, sum(s @ p for s, p in zip(shrinkage, moments, strict=True)))
+        precision = prior + (shrinkage @ grams).sum(0)
+        line = np.linalg.solve(precision, (shrinkage @ moments[..., None]).sum(0)[:, 0])
         gain_weight = (_GAIN_PRIOR_DOF + 1) / (_GAIN_PRIOR_DOF + (line[0] / GAIN_STD) ** 2)
         # Expectation-maximisation: posterior mean and variance of each touch's deviation from the line.
-        deviations = [
-            np.linalg.solve(g + np.diag(1 / touch_var), p - g @ line)
-            for g, p in zip(grams, moments, strict=True)
-        ]
-        variances = [np.diag(np.linalg.inv(g + np.diag(1 / touch_var))) for g in grams]
+        covariances = np.linalg.inv(grams + np.diag(1 / touch_var))
+        deviations = (covariances @ (moments - grams @ line)[..., None])[..., 0]  # (K, 2)
+        variances = np.diagonal(covariances, axis1=1, axis2=2)
         prior_var = np.square([_TOUCH_GAIN_STD * max(1.0, 1 + line[0]), _TOUCH_OFFSET_STD_N])
-        total = _TOUCH_PRIOR_WEIGHT * prior_var + sum(
-            np.square(d) + v for d, v in zip(deviations, variances, strict=True)
-        )
-        touch_var = total / (_TOUCH_PRIOR_WEIGHT + len(parts))
+        total = _TOUCH_PRIOR_WEIGHT * prior_var + (np.square(deviations) + variances).sum(0)
+        touch_var = total / (_TOUCH_PRIOR_WEIGHT + count)
     # A correction never falls, also if the touches of a fold say so: then it is nearly constant.
     gain = max(float(1 + line[0]), _MIN_SLOPE)
     return LinearFit(
@@ -120,34 +152,42 @@ def fit_line(touches: Touches) -> LinearFit:
         offset_n=float(line[1] + (1 + line[0] - gain) * touches.estimate_n.mean()),
         covariance=np.asarray(np.linalg.inv(precision), np.float64),
         touch_std=np.sqrt(touch_var),
-        degrees=len(parts) - 1 + _TOUCH_PRIOR_WEIGHT,
+        degrees=count - 1 + _TOUCH_PRIOR_WEIGHT,
         frame_std_n=frame_std_n,
     )
 
 
-def fit_curve(touches: Touches, line: LinearFit, bend: float) -> OutputCurve:
-    """Fits the curve about its line; ``bend`` is one of `BENDS`."""
-    estimate_n = touches.estimate_n
-    max_estimate_n = max(float(estimate_n.max()), 1.0)
-    segments = int(np.clip(round(max_estimate_n / _SEGMENT_N), 2, _MAX_SEGMENTS))
-    knots = np.linspace(0.0, max_estimate_n, segments + 1)
-    low, high = knots[:-1].copy(), np.diff(knots)
-    inside = np.clip(estimate_n[:, None] - low, 0, high)  # (N, segments)
-    inside[:, 0] = np.minimum(estimate_n, high[0])  # the first and last segment extend beyond the knots
-    inside[:, -1] = np.where(estimate_n > low[-1], estimate_n - low[-1], 0.0)
-    design = np.column_stack([np.ones(len(estimate_n)), inside])
-    target = touches.force_n - line.predict(estimate_n)
-    weight = np.sqrt(_huber_weights(design, target) / _FRAMES_PER_DRAW)
-    penalty = np.zeros((segments, segments + 1))
-    penalty[:, 1:] = line.frame_std_n / bend * np.eye(segments)
-    rows = np.vstack([design * weight[:, None], penalty])
-    values = np.concatenate([target * weight, np.zeros(segments)])
-    lower = np.full(segments + 1, -np.inf)
-    lower[1:] = _MIN_SLOPE - line.gain
-    solution = lsq_linear(rows, values, bounds=(lower, np.inf)).x
-    slopes = np.maximum(line.gain + solution[1:], _MIN_SLOPE)
-    forces = line.offset_n + solution[0] + np.concatenate([[0.0], np.cumsum(slopes * high)])
-    return OutputCurve(kind="monotone", estimate_n=tuple(knots.tolist()), force_n=tuple(forces.tolist()))
+class CurveProblem:
+    """Weighted frames of a curve's fit about a line, for any bend."""
+
+    def __init__(self, touches: Touches, line: LinearFit) -> None:
+        """Prepares the fit to ``touches``, about their line."""
+        estimate_n = touches.estimate_n
+        max_estimate_n = max(float(estimate_n.max()), 1.0)
+        segments = int(np.clip(round(max_estimate_n / _SEGMENT_N), 2, _MAX_SEGMENTS))
+        self._line, self._knots = line, np.linspace(0.0, max_estimate_n, segments + 1)
+        low, high = self._knots[:-1].copy(), np.diff(self._knots)
+        inside = np.clip(estimate_n[:, None] - low, 0, high)  # (N, segments)
+        inside[:, 0] = np.minimum(estimate_n, high[0])  # the first and last segment extend beyond the knots
+        inside[:, -1] = np.where(estimate_n > low[-1], estimate_n - low[-1], 0.0)
+        design = np.column_stack([np.ones(len(estimate_n)), inside])
+        target = touches.force_n - line.predict(estimate_n)
+        weight = np.sqrt(_huber_weights(design, target) / _FRAMES_PER_DRAW)
+        self._rows, self._values = design * weight[:, None], target * weight
+
+    def solve(self, bend: float) -> OutputCurve:
+        """Returns the curve with one of `BENDS`."""
+        line, knots, segments = self._line, self._knots, len(self._knots) - 1
+        penalty = np.zeros((segments, segments + 1))
+        penalty[:, 1:] = line.frame_std_n / bend * np.eye(segments)
+        rows = np.vstack([self._rows, penalty])
+        values = np.concatenate([self._values, np.zeros(segments)])
+        lower = np.full(segments + 1, -np.inf)
+        lower[1:] = _MIN_SLOPE - line.gain
+        solution = lsq_linear(rows, values, bounds=(lower, np.inf)).x
+        slopes = np.maximum(line.gain + solution[1:], _MIN_SLOPE)
+        forces = line.offset_n + solution[0] + np.concatenate([[0.0], np.cumsum(slopes * np.diff(knots))])
+        return OutputCurve(kind="monotone", estimate_n=tuple(knots.tolist()), force_n=tuple(forces.tolist()))
 
 
 def identity(max_estimate_n: float) -> OutputCurve:
@@ -166,14 +206,3 @@ def _huber_weights(design: Floats, target: Floats) -> Floats:
         width = _HUBER_WIDTH * max(1.4826 * float(np.median(residual)), _MIN_STD_N)
         weights = np.minimum(1.0, width / np.maximum(residual, 1e-12))
     return weights
-
-
-def _frame_std_n(designs: list[Floats], targets: list[Floats], weights: list[Floats]) -> float:
-    """Standard deviation of frames about the line of their touch."""
-    total, count = 0.0, 0.0
-    for x, r, w in zip(designs, targets, weights, strict=True):
-        root = np.sqrt(w)
-        fit = np.linalg.lstsq(x * root[:, None], r * root, rcond=None)[0]
-        total += float(w @ np.square(r - x @ fit))
-        count += float(w.sum())
-    return float(np.sqrt(total / count))
