@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from gripper_calibration.procedures import calibrate_load_cell as procedure
 from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell, weigh
 from gripper_force.cli import app
 from gripper_force.config import Config, config_from, load_config
@@ -66,7 +67,10 @@ def config_of(board: Board) -> Config:
     return config_from({"load_cell": cell}, "the test")
 
 
-def test_board_is_calibrated_through_its_driver(board: Board, tmp_path: Path) -> None:
+def test_board_is_calibrated_through_its_driver(
+    board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(procedure, "_SETTLE_NS", NS_PER_S // 5)  # this load needs no time to settle
     rig = tmp_path / "rig.yaml"
     asked: list[str] = []
 
@@ -74,7 +78,7 @@ def test_board_is_calibrated_through_its_driver(board: Board, tmp_path: Path) ->
         asked.append(text)
         board.do(text)
 
-    result = calibrate_load_cell(config_of(board), WEIGHT_N, rig, prompt=ask, seconds=1.5)
+    result = calibrate_load_cell(config_of(board), WEIGHT_N, rig, prompt=ask, seconds=1.0)
     assert [what.split()[0] for what in asked] == ["Take", "Put", "Take"]
     found = read_rig(rig).load_cell
     assert found is not None

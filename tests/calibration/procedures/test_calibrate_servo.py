@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from gripper_calibration.fits.servo_fit import FreePass, ServoPress
 from gripper_calibration.procedures import calibrate_servo as procedure
 from gripper_calibration.procedures.calibrate_camera import calibrate_camera
 from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
+from gripper_calibration.procedures.servo_measurement import measure
 from gripper_force.cli import app
 from gripper_force.cli.output.calibrate import rig_table
 from gripper_force.config import Config, load_config
@@ -46,16 +48,34 @@ def config_of(*overrides: str) -> Config:
     return load_config(None, [*QUICK, *overrides])
 
 
+Measurement = tuple[list[ServoPress], list[FreePass]]
+
+
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Measurement]:
+    """A rig profile, and the presses and passes that it was fitted to."""
     path = tmp_path_factory.mktemp("rig") / "rig.yaml"
     asked: list[str] = []
-    result = calibrate_servo(config_of(), [0.03], path, prompt=lambda text: asked.append(text))
+    measured: list[Measurement] = []
+
+    def noted(*arguments: Any) -> Measurement:
+        measured.append(measure(*arguments))
+        return measured[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(procedure, "measure", noted)
+        result = calibrate_servo(config_of(), [0.03], path, prompt=lambda text: asked.append(text))
     assert asked == ["Put the load cell with its width of 30 mm between the open jaws"]
     assert Path(result.report).stat().st_size > 20_000
     assert (result.presses, result.passes) == (6, 12)
     assert abs(result.width_shift_m) < 0.002
-    return path
+    assert result.width_remark is None
+    return path, measured[0]
+
+
+@pytest.fixture
+def rig(calibrated: tuple[Path, Measurement]) -> Path:
+    return calibrated[0]
 
 
 def about(estimate: CalibratedValue, truth: float, share: float) -> bool:
@@ -82,7 +102,12 @@ def test_torque_and_friction_of_the_scene_are_found(rig: Path) -> None:
     assert load_config(None, [f"calibration.rig={rig}"]).gripper.nm_per_a == found.nm_per_a.value
 
 
-def test_a_gauge_of_another_width_than_named_is_noticed(tmp_path: Path) -> None:
+def test_a_gauge_of_another_width_than_named_is_noticed(
+    calibrated: tuple[Path, Measurement], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    presses, passes = calibrated[1]
+    named = [replace(press, gauge_m=0.036) for press in presses]
+    monkeypatch.setattr(procedure, "measure", lambda *_: (named, passes))
     sets = [part for one in QUICK for part in ("--set", one)]
     rig = ["--rig", str(tmp_path / "rig.yaml")]
     end = CliRunner().invoke(app, ["calibrate", "servo", "--gauge-mm", "36", "--yes", "--json", *rig, *sets])
@@ -90,14 +115,30 @@ def test_a_gauge_of_another_width_than_named_is_noticed(tmp_path: Path) -> None:
     assert "every width is 6 mm larger than the configuration said" in " ".join(end.stderr.split())
 
 
-@pytest.mark.parametrize("name", ["rotary_finger", "four_bar"])
-def test_torque_is_found_through_a_linkage_with_little_free_travel(name: str, tmp_path: Path) -> None:
-    config = load_config(GRIPPERS / f"{name}.yaml", QUICK)
+@pytest.mark.parametrize(("scale", "ratio"), [(0.6, r"0\.6\d"), (1.6, r"1\.7\d")])
+def test_an_implausible_torque_constant_is_refused(
+    calibrated: tuple[Path, Measurement],
+    scale: float,
+    ratio: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    presses, passes = calibrated[1]
+    scaled = [replace(press, force_n=scale * press.force_n) for press in presses]
+    monkeypatch.setattr(procedure, "measure", lambda *_: (scaled, passes))
+    with pytest.raises(DataError, match=rf"Nm/A, {ratio} times the expected .*: calibrate the load cell"):
+        calibrate_servo(config_of(), [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_torque_is_found_through_a_linkage_with_little_free_travel(tmp_path: Path) -> None:
+    config = load_config(GRIPPERS / "rotary_finger.yaml", QUICK)
     calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
     found = read_rig(tmp_path / "rig.yaml").servo
     assert found is not None
     scene = draw_scene("block", config.seed, config.sim)
     assert about(found.nm_per_a, load_model(found.model).nm_per_a * scene.nm_per_a, 0.02)
+    assert found.open_position_rad.value == pytest.approx(0.0, abs=0.03)
 
 
 def test_target_above_the_calibrated_force_is_refused(rig: Path, tmp_path: Path) -> None:
@@ -108,6 +149,7 @@ def test_target_above_the_calibrated_force_is_refused(rig: Path, tmp_path: Path)
 
 def test_profile_of_another_servo_is_refused_or_reported(rig: Path, tmp_path: Path) -> None:
     another = (f"calibration.rig={rig}", "servo.model=XM430-W210", "camera.backend=none", "target_n=2")
+    another += ("control.settle_s=0.3", "control.hold_s=0.3")
     path = tmp_path / "run.mcap"
     with pytest.raises(ConfigError, match=r"rig profile .* was made with servo XM430-W350, not XM430-W210"):
         run_grasp(config_of(*another), path)
@@ -219,6 +261,11 @@ def test_slow_load_cell_that_is_silent_at_first_is_enough(
     assert max(true_force_n) < config.control.force_limit_n
 
 
+def end_presses(text: str, steps: int = 1) -> None:
+    if "free travel" in text:
+        raise DataError("after the presses")
+
+
 @pytest.mark.parametrize(
     ("scale", "overrides"),
     [(0.05, []), (0.3, []), (0.6, []), (0.5, ["sim.gain=1.4", "sim.friction=0.3"])],
@@ -238,9 +285,9 @@ def test_load_cell_with_a_wrong_scale_cannot_raise_the_force_above_its_limit(
     monkeypatch.setattr(SimulatedLoadCell, "drain", drain)
     config = config_of(*overrides)
     with pytest.raises(
-        DataError, match=r"the jaws closed without a force|A give .* N instead of|0.[67]\d times the expected"
+        DataError, match=r"the jaws closed without a force|A give .* N instead of|after the presses"
     ):
-        calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+        calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None, progress=end_presses)
     assert max(true_force_n) < 1.05 * config.control.force_limit_n
 
 

@@ -1,16 +1,20 @@
-"""Signals during a calibration that moves the jaws."""
+"""A servo under torque in a calibration: signals, and a bus that is silent for a moment."""
 
 import signal
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
+from gripper_calibration.procedures.powered_servo import BusCycles, servo_alone, torque_on
 from gripper_force.config import load_config
 from gripper_force.progress import Progress
+from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.process import SIGNALS, raise_interrupt
+from gripper_force.runtime.resolve import resolve
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
 
@@ -62,3 +66,18 @@ def test_signals_of_a_lost_connection_leave_the_torque_off(
     assert len(buses) == 1
     assert buses[0].servos[0].get("torque_enable") == 0
     assert signal.getsignal(number) is raise_interrupt
+
+
+def test_a_silence_of_the_bus_that_the_watchdog_tolerates_is_no_error() -> None:
+    fault = "faults=[{unit: bus, kind: slow, at_s: 0.05, for_s: 0.02}]"
+    config = resolve(
+        servo_alone(load_config(None, ["object=none", "sim.detail=coarse", fault])), vision=False
+    ).config
+    with open_devices(config) as devices, torque_on(devices.servo) as (state, raise_if_interrupted):
+        cycles = BusCycles(config, devices, state, raise_if_interrupted)
+        times_ns = []
+        while not times_ns or times_ns[-1] < times_ns[0] + 100_000_000:
+            times_ns.append(cycles.read().t_ns)
+            cycles.write(cycles.state.position_rad, 0.0, cycles.approach_m_s)
+    periods_ns = [after - before for before, after in pairwise(times_ns)]
+    assert max(periods_ns) > 15_000_000 > 3 * min(periods_ns) - 1, "the bus was silent once"
