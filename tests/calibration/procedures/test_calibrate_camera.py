@@ -1,21 +1,23 @@
 """Calibration of the simulated camera, with known lag, latency and markers."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 import yaml
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from gripper_calibration.fits.camera_fit import estimate_lag
-from gripper_calibration.procedures import calibrate_camera as calibrate_camera_module
+from gripper_calibration.procedures import calibrate_camera as procedure
 from gripper_calibration.procedures.calibrate_camera import calibrate_camera, compute_ms, observe
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.jobs.recording.record import RecordingPlan, record
+from gripper_force.jobs.recording.record import record
 from gripper_force.profiles.apply import read_profiles, rig_mismatches
 from gripper_force.profiles.object_profile import find_object
 from gripper_force.profiles.rig_profile import read_rig
@@ -30,11 +32,35 @@ WHOLE = (0, 0, 128, 128)
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path, Path]:
+    """The end of the command, its rig profile, and its log of touches with visible markers."""
+    rig = tmp_path_factory.mktemp("rig") / "rig.yaml"
+    log = tmp_path_factory.mktemp("touches") / "log.mcap"
+
+    def keep(*arguments: Any) -> list[Path]:
+        (path,) = record(*arguments)
+        shutil.copy(path, log)
+        return [path]
+
+    asked = ["calibrate", "camera", "--rig", rig, "--exposure-us", 500, "--exposure-us", 4000, "--json"]
+    sets = [part for key in (*QUICK, "sim.markers=true", "sim.lux=550") for part in ("--set", key)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(procedure, "record", keep)
+        done = CliRunner().invoke(app, [str(part) for part in (*asked, "--touches", 5, "--seed", 0, *sets)])
+    assert done.exit_code == 0, done.stderr
+    return done, rig, log
+
+
+@pytest.fixture
+def log(calibrated: tuple[Result, Path, Path]) -> Path:
     """A set of touches with visible markers."""
-    config = load_config(None, [*QUICK, "sim.markers=true"])
-    (path,) = record(config, RecordingPlan(1, 5), tmp_path_factory.mktemp("touches"), lambda *_: None)
-    return path
+    return calibrated[2]
+
+
+@pytest.fixture
+def recorded(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes a calibration take the log instead of touches of its own."""
+    monkeypatch.setattr(procedure, "record", lambda *_: [log])
 
 
 def shifted(log: Path, folder: Path, by_ms: float) -> Path:
@@ -78,12 +104,8 @@ def test_computing_time_is_measured_in_real_time(log: Path, tiny_checkpoint: Pat
     assert 0 < compute_ms(config.with_values(clock="realtime"), gray) < 1000
 
 
-def test_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
-    rig = tmp_path / "rig.yaml"
-    asked = ["calibrate", "camera", "--rig", rig, "--exposure-us", 500, "--exposure-us", 4000, "--json"]
-    sets = [part for key in (*QUICK, "sim.markers=true", "sim.lux=550") for part in ("--set", key)]
-    done = CliRunner().invoke(app, [str(part) for part in (*asked, "--touches", 4, "--seed", 0, *sets)])
-    assert done.exit_code == 0, done.stderr
+def test_command_writes_profile_reference_and_report(calibrated: tuple[Result, Path, Path]) -> None:
+    done, rig, _ = calibrated
     last = done.stderr.splitlines()[-1]
     assert last.startswith("next: gripper-force calibrate object NAME --seed 0 --set ")
     assert last.endswith(f" --set calibration.rig={rig}")
@@ -95,8 +117,8 @@ def test_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
     assert found.lag_ms.high is not None
     assert found.lag_ms.low < 0 < found.lag_ms.high
     assert found.delay_ms.value == pytest.approx(result["use_ms"] + 500 / 30 + found.lag_ms.value, abs=1.0)
-    assert result["touches"] == 4
-    reference = cv2.imread(str(tmp_path / found.reference))
+    assert result["touches"] == 5
+    reference = cv2.imread(str(rig.with_name(found.reference)))
     assert reference is not None
     assert reference.shape == (128, 128, 3)
     assert cv2.imread(result["report"]) is not None
@@ -106,9 +128,10 @@ def test_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
     assert config.control.plant_delay_ms == found.delay_ms.value
 
 
+@pytest.mark.usefixtures("recorded")
 def test_automatic_exposure_stays_automatic(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
-    calibrate_camera(load_config(None, [*QUICK, "camera.exposure_us=null"]), rig, region=WHOLE, touches=3)
+    calibrate_camera(load_config(None, [*QUICK, "camera.exposure_us=null"]), rig, region=WHOLE)
     found = read_rig(rig).camera
     assert found is not None
     assert found.exposure_us is None
@@ -121,9 +144,10 @@ def mismatches(config: Config) -> list[str]:
     return rig_mismatches(config, read_profiles(config))
 
 
+@pytest.mark.usefixtures("recorded")
 def test_different_camera_is_refused_or_reported(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
-    calibrate_camera(load_config(None, QUICK), rig, region=(4, 4, 120, 120), exposures_us=[4000], touches=3)
+    calibrate_camera(load_config(None, QUICK), rig, region=(4, 4, 120, 120), exposures_us=[4000])
     found = read_rig(rig).camera
     assert found is not None
     assert (found.region, found.markers) == ((4, 4, 120, 120), False)
@@ -142,17 +166,14 @@ def test_different_camera_is_refused_or_reported(tmp_path: Path) -> None:
     assert mismatches(load_config(None, [*named, "camera.backend=none"])) == []
 
 
-def test_without_markers_nothing_is_written(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("recorded")
+def test_without_markers_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(procedure, "find_markers", lambda _: {})
     with pytest.raises(
         DataError,
         match=r"no image shows both markers completely: of [\d.]+ images, marker [\d.]+ in [\d.]+ and mark",
     ):
-        calibrate_camera(
-            load_config(None, [*QUICK, "camera.rate_hz=10"]),
-            tmp_path / "rig.yaml",
-            exposures_us=[4000],
-            touches=3,
-        )
+        calibrate_camera(load_config(None, QUICK), tmp_path / "rig.yaml", exposures_us=[4000])
     assert not list(tmp_path.iterdir())
 
 
@@ -228,9 +249,9 @@ def test_a_new_exposure_names_what_it_outdates(
     before = load_config(None, [f"vision.checkpoint={network}"])
     after = load_config(None, [f"vision.checkpoint={network}", "camera.exposure_us=2000"])
     why = "(camera.exposure_us 4000, not 2000)"
-    assert calibrate_camera_module._outdated(before, after) == (
+    assert procedure._outdated(before, after) == (
         f"the profile {folder / 'mug.yaml'} {why}",
         f"the bundle {folder / 'taught/profile.yaml'} {why}",
         f"the network {network} {why}",
     )
-    assert calibrate_camera_module._outdated(before, before) == ()
+    assert procedure._outdated(before, before) == ()
