@@ -1,14 +1,19 @@
-"""The examples of the library, run as a user runs them: in lockstep, and in real time behind a pseudo-terminal."""
+"""The examples of the library: in lockstep, and in real time behind a pseudo-terminal."""
 
-import os
+import runpy
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import yaml
 
+import gripper_force as gf
+from gripper_force.interfaces import Camera, Clock
+from gripper_force.testing.camera_contract import CameraContract
 from gripper_hw.dynamixel.pty_server import PtyServer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -33,44 +38,51 @@ def write(path: Path, keys: dict[str, object]) -> Path:
     return path
 
 
-def start(name: str, *arguments: object) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-u", str(EXAMPLES / name), *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+@pytest.fixture
+def beside_examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes the modules in the folder importable, as they are for a program in it."""
+    monkeypatch.syspath_prepend(EXAMPLES)
 
 
-def run_beside_examples(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-    """Runs Python with the examples on its path."""
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(EXAMPLES), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=120, check=False)
+@pytest.fixture
+def run(beside_examples: None, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs an example as the main program, with arguments."""
+
+    def run(name: str, *arguments: Path) -> None:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+    return run
 
 
 def test_embed_fits_on_a_page() -> None:
     assert len((EXAMPLES / "embed.py").read_text().splitlines()) <= 26
 
 
-def test_embed_holds_an_object_in_lockstep(lockstep: Path) -> None:
-    with start("embed.py", lockstep) as process:
-        out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    results = [line for line in out.splitlines() if "GraspResult" in line]
+def test_embed_holds_an_object_in_lockstep(
+    run: Callable[..., None], lockstep: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("embed.py", lockstep)
+    lines = capsys.readouterr().out.splitlines()
+    results = [line for line in lines if "GraspResult" in line]
     assert len(results) == 3
     assert "held" in results[0]
     assert "held" in results[1]
-    assert any(" N at " in line for line in out.splitlines())
+    assert any(" N at " in line for line in lines)
 
 
-def test_embed_in_real_time_without_an_object(real_time: Path, server: PtyServer) -> None:
-    with start("embed.py", real_time) as process:
-        out, err = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert "no_object" in out
-    assert "RequestError: no object is gripped" in err  # an exception in the caller's code
+def test_embed_in_real_time_without_an_object(
+    run: Callable[..., None], real_time: Path, server: PtyServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(gf.RequestError, match="no object is gripped"):  # in the caller's code
+        run("embed.py", real_time)
+    assert "no_object" in capsys.readouterr().out
     assert server.bus.servos[0].get("torque_enable") == 0
 
 
 def test_ctrl_c_ends_embed_without_torque(real_time: Path, server: PtyServer) -> None:
-    with start("embed.py", real_time) as process:
+    command = [sys.executable, "-u", EXAMPLES / "embed.py", real_time]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         while "approach" not in process.stdout.readline():
             assert process.poll() is None
@@ -82,43 +94,41 @@ def test_ctrl_c_ends_embed_without_torque(real_time: Path, server: PtyServer) ->
     assert server.bus.servos[0].get("torque_enable") == 0
 
 
-def test_an_own_camera_serves_a_grasp_that_holds() -> None:
-    with start("own_camera.py") as process:
-        out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+def test_an_own_camera_serves_a_grasp_that_holds(
+    run: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("own_camera.py")
+    out = capsys.readouterr().out
     assert "held" in out
     assert "(64, 64)" in out
 
 
-OWN_CAMERA_IN_REAL_TIME = """
-import sys
-import gripper_force as gf
-overrides = {"clock": "realtime", "servo.port": sys.argv[1], "servo.bus_watchdog_ms": 2540,
-    "servo.reply_margin_ms": 500, "load_cell.backend": "none", "camera.backend": "own_camera:PatternCamera",
-    "vision.checkpoint": "none", "control.feedback": "current"}
-with gf.open_gripper(overrides=overrides) as gripper:
-    gripper.move(0.06)
-    assert gripper.frame.gray.shape == (128, 128)
-    print("frames", gripper.frame.seq > 10)
-"""
-
-
+@pytest.mark.usefixtures("beside_examples")
 def test_own_camera_in_real_time(server: PtyServer) -> None:
-    done = run_beside_examples("-c", OWN_CAMERA_IN_REAL_TIME, server.device_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == "frames True\n"
+    overrides = {
+        "clock": "realtime",
+        "servo.port": server.device_path,
+        "servo.bus_watchdog_ms": 2540,
+        "servo.reply_margin_ms": 500,
+        "load_cell.backend": "none",
+        "camera.backend": "own_camera:PatternCamera",
+        "vision.checkpoint": "none",
+        "control.feedback": "current",
+    }
+    with gf.open_gripper(overrides=overrides) as gripper:
+        gripper.move(0.06)
+        assert gripper.frame is not None
+        assert gripper.frame.gray.shape == (128, 128)
+        assert gripper.frame.seq > 10
 
 
-def test_own_camera_satisfies_the_contract(tmp_path: Path) -> None:
-    program = (
-        "import pytest, own_camera, gripper_force as gf\n"
-        "from gripper_force.runtime.backends import MonotonicClock\n"
-        "from gripper_force.testing.camera_contract import CameraContract\n"
-        "class TestPatternCamera(CameraContract):\n"
-        "    @pytest.fixture\n"
-        "    def camera(self):\n"
-        "        return own_camera.PatternCamera(gf.CameraConfig(), MonotonicClock())\n"
-    )
-    (tmp_path / "test_own.py").write_text(program)
-    done = run_beside_examples("-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path / "test_own.py")
-    assert done.returncode == 0, done.stdout
+class TestPatternCamera(CameraContract):
+    @pytest.fixture
+    def clock(self, clock: Clock) -> Clock:
+        """The simulated clock, which waits for nothing."""
+        return clock
+
+    @pytest.fixture
+    def camera(self, beside_examples: None, clock: Clock) -> Camera:
+        camera: Camera = import_module("own_camera").PatternCamera(gf.CameraConfig(), clock)
+        return camera

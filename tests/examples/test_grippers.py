@@ -7,17 +7,20 @@ import numpy as np
 import pytest
 
 import gripper_force as gf
-from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_force.config import ServoConfig, load_config
-from gripper_force.profiles.rig_profile import read_rig
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Phase
 from gripper_hw.dynamixel.control_table import load_model, model_names
-from gripper_hw.sim.scene import draw_scene
 
 GRIPPERS = sorted((Path(__file__).parents[2] / "examples/grippers").glob("*.yaml"))
 TABLE = "[[0.0, 0.092], [0.5, 0.075], [1.0, 0.052], [1.5, 0.030], [2.0, 0.012]]"
 MODELS = ["XM430-W350", "XL330-M288", "XC330-T288", "XH540-W270", "XD430-T210", "XW540-T260"]
+TRANSMISSIONS = [*GRIPPERS, None]
+# Each transmission with its own servo (None), and each family with another transmission.
+PAIRS = [
+    *((path, None) for path in TRANSMISSIONS),
+    *zip([*TRANSMISSIONS[3:], *TRANSMISSIONS[:2]], MODELS, strict=True),
+]
 
 
 def test_every_family_of_servos_is_tried() -> None:
@@ -36,12 +39,12 @@ def test_free_jaws_arrive_at_each_width(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "target_n"), [*((model, 2.0) for model in MODELS), (None, 3.5)], ids=[*MODELS, "own servo"]
+    ("path", "model"),
+    PAIRS,
+    ids=[f"{path.stem if path else 'table'}-{model or 'own servo'}" for path, model in PAIRS],
 )
-@pytest.mark.parametrize("path", [*GRIPPERS, None], ids=lambda path: path.stem if path else "table")
-def test_the_force_is_held_by_motor_current(
-    path: Path | None, model: str | None, target_n: float, tmp_path: Path
-) -> None:
+def test_the_force_is_held_by_motor_current(path: Path | None, model: str | None, tmp_path: Path) -> None:
+    target_n = 3.5 if model is None else 2.0
     overrides = ["object=block", "sim.detail=coarse", "camera.backend=none", "seed=3", "log.report=false"]
     if path is None:
         overrides.append(f"gripper.linkage={{kind: table, table: {TABLE}}}")
@@ -68,17 +71,3 @@ def test_the_force_is_held_by_motor_current(
         for before, after in pairwise(statuses[::5])
     ]
     assert max(speeds_m_s) < 1.5 * config.control.approach_speed_m_s
-
-
-def test_calibrate_servo_finds_the_torque_constant_through_a_linkage(tmp_path: Path) -> None:
-    # The travel of a jaw grows from 14 to 26 mm per radian.
-    rows = [[angle, 0.092 - 2 * (0.014 * angle + 0.0025 * angle**2)] for angle in (0.0, 0.6, 1.2, 1.8, 2.3)]
-    linkage = f"gripper.linkage={{kind: table, table: {rows}}}"
-    config = load_config(None, ["object=block", "sim.detail=coarse", "seed=7", linkage])
-    calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
-    found = read_rig(tmp_path / "rig.yaml").servo
-    assert found is not None
-    scene = draw_scene("block", config.seed, config.sim)
-    true_nm_per_a = load_model(found.model).nm_per_a * scene.nm_per_a
-    assert found.nm_per_a.value == pytest.approx(true_nm_per_a, rel=0.02)
-    assert found.open_position_rad.value == pytest.approx(0.0, abs=0.03)
