@@ -48,13 +48,19 @@ def read(path: Path, checkpoint: Path) -> TouchRecording:
     return read_log(path, engine.header.preprocess, partial(features, engine))
 
 
-def test_join_refuses_logs_of_different_objects_or_load_cells(tmp_path: Path, tiny_checkpoint: Path) -> None:
+def test_join_refuses_logs_of_different_objects_cameras_or_load_cells(
+    tmp_path: Path, tiny_checkpoint: Path
+) -> None:
     forces_n = [0.0] * 10 + [2.0] * 20
     mug = read(recording(tmp_path / "a.mcap", forces_n), tiny_checkpoint)
     for keys, sentence in (
         ("object: cup", "object cup, and .*a.mcap with mug"),
         ("object: mug\nload_cell: {n_per_raw: 2.0}", r"load_cell\.n_per_raw 2.0"),
         ("object: mug\nload_cell: {backend: phidget}", "load cell phidget"),
+        (
+            "object: mug\nvision: {region: [0, 0, 48, 48]}",
+            r"vision.region \[0, 0, 48, 48\], and .*a.mcap with None",
+        ),
     ):
         other = read(recording(tmp_path / "b.mcap", forces_n, keys=keys), tiny_checkpoint)
         with pytest.raises(DataError, match=sentence):

@@ -3,10 +3,6 @@
 import json
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +21,7 @@ from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, find_logs, load_clips
 from gripper_force.jobs.evaluate import evaluate
+from gripper_force.jobs.profile_files import write_all
 from gripper_force.jobs.training import recipe as recipes
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
@@ -36,7 +33,7 @@ from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import read_checkpoint
 from gripper_force.vision.preprocess import Preprocess
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "no_figures")
 
 
 OBJECTS = Path(__file__).parents[3] / "examples" / "objects"
@@ -134,36 +131,47 @@ def test_best_candidate_is_taken_and_its_error_is_that_on_new_touches(
 
 
 def test_finished_parts_are_not_repeated(
-    taught: Taught, config: Config, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    taught: Taught,
+    config: Config,
+    logs: list[Path],
+    work: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Three of the trainings are missing; the work is interrupted while the second of them is written."""
+    folder, out = tmp_path / "work", tmp_path / "bundle"
+    shutil.copytree(work, folder)
+    parts = sorted((folder / "teach").glob("*.left"), key=lambda path: path.stat().st_size)
+    assert len(parts) == 8  # the network as it is, six trainings, and the process
+    for path in parts[:3]:
+        path.unlink()
     evaluated: list[str] = []
-    evaluate = candidates._evaluate
+    make = candidates._evaluate
 
-    def counting(task: candidates._Task) -> None:
-        evaluated.append("again")
-        evaluate(task)
-
-    def stopping(task: candidates._Task) -> None:
-        if len(evaluated) == 3:
-            raise KeyboardInterrupt
-        evaluate(task)
+    def noting(task: candidates._Task) -> None:
         evaluated.append(task.candidate.name)
+        make(task)
 
-    monkeypatch.setattr(candidates, "_evaluate", stopping)
+    def interrupted(files: dict[Path, bytes]) -> None:
+        if len(evaluated) == 2:
+            raise KeyboardInterrupt
+        write_all(files)
+
+    monkeypatch.setattr(candidates, "_evaluate", noting)
+    monkeypatch.setattr(candidates, "write_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        teach(config, "disc", logs=logs, folder=tmp_path / "work", out=tmp_path / "bundle")
-    assert not (tmp_path / "bundle").exists()
-    monkeypatch.setattr(candidates, "_evaluate", counting)
+        teach(config, "disc", logs=logs, folder=folder, out=out)
+    assert not out.exists()
     steps: list[int] = []
     resumed = teach(
         config,
         "disc",
         logs=logs,
-        folder=tmp_path / "work",
-        out=tmp_path / "bundle",
+        folder=folder,
+        out=out,
         progress=lambda _text, steps_done=1: steps.append(steps_done),
     )
-    assert evaluated.count("again") == 8 - 3  # the network as it is, six trainings, and the process
+    assert evaluated == 4 * ["tiny.safetensors, trained"]
     assert sum(steps) == STEPS
     assert resumed.candidates_mae_n == taught.candidates_mae_n
     assert resumed.profile.weights == taught.profile.weights
@@ -343,7 +351,7 @@ def test_two_files_of_one_name_share_no_bundle(
         path.write_text((OBJECTS / "avocado.yaml").read_text(encoding="utf-8"), encoding="utf-8")
     first, second = (load_config(None, [f"object={path}", f"vision.checkpoint={network}"]) for path in files)
     for _ in range(2):  # one that exists is replaced
-        assert teach(first, "part", logs=logs, folder=tmp_path / "work").bundle == home / "part"
+        assert teach(first, "part", logs=logs[:4], folder=tmp_path / "work").bundle == home / "part"
     with pytest.raises(
         ConfigError, match=r"part is that of the object in .*a/part\.yaml, not of .*b/part\.yaml; "
     ):
@@ -406,11 +414,11 @@ def test_a_missing_network_is_found_before_the_first_touch(config: Config, tmp_p
     assert not (tmp_path / "touches").exists()
 
 
+@pytest.mark.usefixtures("as_it_is")
 def test_an_interrupted_replacement_keeps_the_old_bundle(
     taught: Taught,
     config: Config,
     logs: list[Path],
-    work: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -425,11 +433,11 @@ def test_an_interrupted_replacement_keeps_the_old_bundle(
 
     monkeypatch.setattr(Path, "rename", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        teach(config, "disc", logs=logs, folder=work, out=out)
+        teach(config, "disc", logs=logs[:4], folder=tmp_path / "work", out=out)
     assert read_object(out / "profile.yaml") == taught.profile
     rename(out, out.with_name(".disc.old"))  # as a kill between the two leaves it
     with pytest.raises(KeyboardInterrupt):
-        teach(config, "disc", logs=logs, folder=work, out=out)
+        teach(config, "disc", logs=logs[:4], folder=tmp_path / "work", out=out)
     assert read_object(out / "profile.yaml") == taught.profile
 
 
@@ -446,7 +454,12 @@ def test_folder_that_is_no_bundle_is_not_replaced(
 
 
 def test_command_prints_the_choice_and_the_next_command(
-    taught: Taught, network: Path, logs: list[Path], work: Path, tmp_path: Path
+    taught: Taught,
+    network: Path,
+    logs: list[Path],
+    work: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     call = ["teach", "disc", "--from", str(logs[0].parent), "--folder", str(work), "--jobs", "1"]
     call += ["--set", f"vision.checkpoint={network}", "--seed", "3"]
@@ -457,6 +470,9 @@ def test_command_prints_the_choice_and_the_next_command(
     assert found["minutes"] > 0
     assert "next: gripper-force grasp --object disc --target-n 4 --seed 3\n" in result.stderr
     assert found["coverages"]
+    both = CliRunner().invoke(app, [*call, "--fresh"])
+    assert isinstance(both.exception, ConfigError)
+    monkeypatch.setattr(job, "teach", lambda *_, **__: taught)
     rig = tmp_path / "my.yaml"
     rig.write_text(f"vision: {{checkpoint: {network}}}\n", encoding="utf-8")
     table = CliRunner().invoke(
@@ -471,29 +487,6 @@ def test_command_prints_the_choice_and_the_next_command(
     named = CliRunner().invoke(app, ["teach", str(own), *call[2:]], catch_exceptions=False)
     assert named.exit_code == 0
     assert f"--object {own} --target-n 4" in named.stderr.replace("\n", "")
-    both = CliRunner().invoke(app, [*call, "--fresh"])
-    assert isinstance(both.exception, ConfigError)
-
-
-def test_killed_command_continues(network: Path, logs: list[Path], tmp_path: Path) -> None:
-    """The process is killed while it works; the same command then uses what was finished."""
-    work = tmp_path / "work" / "teach"
-    start = f"from gripper_force.jobs.training.recipe import RECIPES; RECIPES['touches'] |= {SHORT}; "
-    start += "from gripper_force.cli import main; main()"
-    call = [sys.executable, "-c", start, "teach", "disc", "--jobs", "1", "--json"]
-    call += [part for log in logs[:MIN_LOGS] for part in ("--from", str(log))]
-    call += ["--folder", str(tmp_path / "work"), "--out", str(tmp_path / "bundle")]
-    call += ["--set", f"vision.checkpoint={network}"]
-    with subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
-        while running.poll() is None and len(list(work.glob("*.left"))) < 2:
-            time.sleep(0.01)
-        running.send_signal(signal.SIGKILL)
-    kept = {path: path.stat().st_mtime_ns for path in work.glob("*.left")}
-    assert 2 <= len(kept) < 7
-    assert not (tmp_path / "bundle").exists()
-    assert CliRunner().invoke(app, call[3:]).exit_code == 0
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert (tmp_path / "bundle" / "profile.yaml").is_file()
 
 
 def test_provenance_counts_rigs(logs: list[Path]) -> None:
