@@ -56,7 +56,7 @@ def test_frames_without_contact_do_not_narrow_the_interval() -> None:
 def test_interval_contains_new_touches_whose_own_errors_are_normal(touches: int) -> None:
     """Each touch has one gain error, so that its frames are one draw."""
     covered = []
-    for seed in range(300):
+    for seed in range(150):
         rng = np.random.default_rng(seed)
         force_n = np.tile(np.linspace(0.3, 8, 20), touches)
         touch = np.repeat(np.arange(touches), 20)
