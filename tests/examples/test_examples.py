@@ -81,7 +81,7 @@ def test_embed_in_real_time_without_an_object(
 
 
 def test_ctrl_c_ends_embed_without_torque(real_time: Path, server: PtyServer) -> None:
-    command = [sys.executable, "-u", EXAMPLES / "embed.py", real_time]
+    command = [sys.executable, "-u", str(EXAMPLES / "embed.py"), str(real_time)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         while "approach" not in process.stdout.readline():

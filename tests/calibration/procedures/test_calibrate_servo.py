@@ -148,8 +148,8 @@ def test_target_above_the_calibrated_force_is_refused(rig: Path, tmp_path: Path)
 
 
 def test_profile_of_another_servo_is_refused_or_reported(rig: Path, tmp_path: Path) -> None:
-    another = (f"calibration.rig={rig}", "servo.model=XM430-W210", "camera.backend=none", "target_n=2")
-    another += ("control.settle_s=0.3", "control.hold_s=0.3")
+    another = [f"calibration.rig={rig}", "servo.model=XM430-W210", "camera.backend=none", "target_n=2"]
+    another += ["control.settle_s=0.3", "control.hold_s=0.3"]
     path = tmp_path / "run.mcap"
     with pytest.raises(ConfigError, match=r"rig profile .* was made with servo XM430-W350, not XM430-W210"):
         run_grasp(config_of(*another), path)

@@ -75,7 +75,7 @@ def test_a_silence_of_the_bus_that_the_watchdog_tolerates_is_no_error() -> None:
     ).config
     with open_devices(config) as devices, torque_on(devices.servo) as (state, raise_if_interrupted):
         cycles = BusCycles(config, devices, state, raise_if_interrupted)
-        times_ns = []
+        times_ns: list[int] = []
         while not times_ns or times_ns[-1] < times_ns[0] + 100_000_000:
             times_ns.append(cycles.read().t_ns)
             cycles.write(cycles.state.position_rad, 0.0, cycles.approach_m_s)
