@@ -68,13 +68,15 @@ def network(press: Callable[..., Clip], tmp_path_factory: pytest.TempPathFactory
     config = TrainConfig(
         attentions=("ssam",),
         width=0.5,
+        hidden=32,
+        head=64,
         preprocess=Preprocess(size=16),
         steps=60,
         clips=6,
         device="cpu",
         seed=1,
     )
-    train(config, [replace(press(seed), object=f"o{seed}") for seed in range(20, 28)], path)
+    train(config, [replace(press(seed), object=f"o{seed}") for seed in range(20, 28)], path, figure=False)
     return path
 
 
