@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -20,6 +19,7 @@ from gripper_force.config import Config, load_config
 from gripper_force.control.linkage import make_linkage
 from gripper_force.errors import DataError, DeviceError
 from gripper_force.interfaces import Devices
+from gripper_force.progress import Progress, Prompt
 from gripper_force.runtime.backends import open_devices
 from gripper_force.types import ServoState
 from gripper_hw.dynamixel.servo import DynamixelServo
@@ -45,10 +45,11 @@ def home(*overrides: str) -> JawsResult:
     return result
 
 
+LITTLE = ("gripper.friction_n=0.1",)
 WRONG = ("gripper.closing_sign=-1", "gripper.open_position_rad=2", "gripper.friction_n=5")
 
 
-@pytest.mark.parametrize("overrides", [("gripper.friction_n=0.1",), WRONG], ids=["little friction", "wrong"])
+@pytest.mark.parametrize("overrides", [LITTLE, WRONG], ids=["little friction", "wrong"])
 def test_ends_direction_and_friction_are_found_with_any_configuration(overrides: tuple[str, ...]) -> None:
     result = home("seed=3", *overrides)
     scene = draw_scene("none", 3, config_of().sim)
@@ -180,15 +181,17 @@ def test_device_failure_turns_torque_off(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_command_prints_the_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
-    found_jaws: list[JawsResult] = []
+    configs: list[Config] = []
 
-    def calibrate_once(*arguments: Any, **named: Any) -> JawsResult:
-        found_jaws[:] = found_jaws or [calibrate_jaws(*arguments, **named)]
-        return found_jaws[0]
+    def homed(config: Config, *, prompt: Prompt, progress: Progress) -> JawsResult:
+        configs.append(config)
+        prompt("Take everything from between the jaws")
+        progress("moving", 0)
+        return home("seed=3", *LITTLE)
 
-    monkeypatch.setattr(procedure, "calibrate_jaws", calibrate_once)
+    monkeypatch.setattr(procedure, "calibrate_jaws", homed)
     call = ["calibrate", "jaws", "--yes", "--set", "object=none", "--set", "sim.detail=coarse"]
-    done = CliRunner().invoke(app, call)
+    done = CliRunner().invoke(app, call, catch_exceptions=False)
     assert done.exit_code == 0
     assert "closing_sign: 1" in done.stdout
     assert (
@@ -197,3 +200,4 @@ def test_command_prints_the_configuration(monkeypatch: pytest.MonkeyPatch) -> No
     found = json.loads(CliRunner().invoke(app, [*call, "--json"]).stdout)
     assert found["closing_sign"] == 1
     assert found["open_width_m"] > 0.09
+    assert configs == 2 * [load_config(None, ["object=none", "sim.detail=coarse"])]
