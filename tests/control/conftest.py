@@ -56,6 +56,7 @@ class Run:
     inputs: list[tuple[int, ServoState, VisualForce | None, Request | None]] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     cell: list[LoadCellSample] = field(default_factory=list)
+    speeds_m_s: list[float] = field(default_factory=list)  # of the jaws, positive while they close
     spoil: Callable[[int, ServoState], ServoState] = lambda _, servo: servo
 
     def __post_init__(self) -> None:
@@ -76,11 +77,12 @@ class Run:
             self.decisions.append(self.controller.step(*self.inputs[-1]))
             self.cell.append(LoadCellSample(self.t_ns, self.plant.force_n, 0.0))
             self.plant.advance(self.decisions[-1].command, CYCLE_NS / NS_PER_S)
+            self.speeds_m_s.append(self.plant.v_m_s)
             self.t_ns += CYCLE_NS
             request = None
         return self
 
-    def grasp(self, target_n: float, time_s: float = 6.0) -> "Run":
+    def grasp(self, target_n: float, time_s: float = 4.0) -> "Run":
         return self.go(time_s, RequestKind.GRASP, target_n)
 
     def move(self, width_m: float, time_s: float = 4.0) -> "Run":
@@ -95,9 +97,14 @@ class Run:
         self.go(0.005, RequestKind.GRASP, 4.0)
         if phase == Phase.RELEASE:
             self.go(0.5).go(0.005, RequestKind.RELEASE)
-        while self.last.status.phase != phase:
+        return self.until(lambda status: status.phase == phase, 5.0)
+
+    def until(self, is_wanted: Callable[[GraspStatus], bool], within_s: float = 40.0) -> "Run":
+        """Steps until a status, from the last request on."""
+        end_ns = self.t_ns + round(within_s * NS_PER_S)
+        while not is_wanted(self.last.status):
+            assert self.t_ns < end_ns, self.last.status
             self.go(0.005)
-            assert self.t_ns < 5e9
         return self
 
     @property

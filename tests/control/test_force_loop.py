@@ -72,7 +72,7 @@ def test_too_much_force_reverses_the_motor_force_within_friction(loop, transmiss
 
 
 @pytest.mark.parametrize("feedback", ["fused", "current", "vision"])
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=15)
 @given(forces_n=st.lists(st.floats(-100, 100), min_size=5, max_size=5), target_n=st.floats(0.1, 12))
 def test_no_estimate_drives_the_motor_force_out_of_its_plausible_range(
     transmission, feedback, forces_n, target_n

@@ -173,7 +173,7 @@ def test_every_kind_is_drawn() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_any_geometry_is_refused_or_has_all_properties_of_a_linkage(kind: str, data: st.DataObject) -> None:
     keys, open_width_m = KINDS[kind](data.draw)

@@ -18,6 +18,10 @@ FAR = {"contact_m": 1.0}
 PHASES = ("open", "approach", "contact", "ramp", "hold", "release", "move")
 
 
+def has_ended(status):
+    return status.outcome != ""
+
+
 def motor_limit_a(run):
     """Goal current of the approach force plus friction, on the servo's grid."""
     rig = run.transmission
@@ -49,19 +53,19 @@ def test_move_to_the_present_width_ends_at_once(make_run):
     assert any(reason.startswith("moved to 52.0 mm") for reason in run.reasons)
 
 
-@pytest.mark.parametrize("limit_n", [0.9, 1.2, 2.0])
+@pytest.mark.parametrize("limit_n", [0.9, 2.0])
 @pytest.mark.parametrize("contact_m", [0.004, 0.02])
 def test_a_move_onto_an_object_keeps_the_force_limit_whatever_friction_is_configured(
     make_run, limit_n, contact_m
 ):
     friction_n = make_run().transmission.friction_n
     plant = {"friction_n": 0.3 * friction_n, "gain": 1.35, "contact_m": contact_m, "stiffness_n_m": 26_000.0}
-    run = make_run(plant=plant, force_limit_n=limit_n).move(0.03, 35.0)
+    run = make_run(plant=plant, force_limit_n=limit_n).move(0.03, 0.005).until(has_ended)
     assert run.last.status.outcome == "blocked"
-    assert 0.0 < run.plant.peak_n <= 1.05 * limit_n
+    assert 0.0 < run.go(2.0).plant.peak_n <= 1.05 * limit_n
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=15)
 @given(
     start_m=st.floats(0.0, 0.044),
     width_m=st.floats(0.004, OPEN_M),
@@ -74,13 +78,9 @@ def test_speed_and_lead_are_bounded_and_the_width_is_reached(
 ):
     plant = {**FAR, "x_m": start_m, "mass_kg": mass_kg, "friction_n": friction_n}
     run = make_run(plant=plant, approach_speed_m_s=speed_m_s)
-    run.go(0.005, "move", width_m=width_m)
-    speeds_m_s = []
-    for _ in range(1200):
-        run.go(0.005)
-        speeds_m_s.append(abs(run.plant.v_m_s))
+    run.move(width_m, 0.005).until(has_ended, 6.0).go(0.3)
     # The servo's position loop overshoots the speed of its goal by no more than this while settling.
-    assert max(speeds_m_s) <= 1.2 * speed_m_s + 0.001
+    assert max(map(abs, run.speeds_m_s)) <= 1.2 * speed_m_s + 0.001
     assert run.last.status.width_m == pytest.approx(width_m, abs=0.0005)
     assert not any("obstacle" in reason for reason in run.reasons)
     goals_m = [run.transmission.width_m(d.command.goal_position_rad) for d in run.decisions]
@@ -90,7 +90,7 @@ def test_speed_and_lead_are_bounded_and_the_width_is_reached(
     assert all(abs(b - a) <= 2 * speed_m_s * 0.005 + 1e-9 for a, b in pairwise(goals_m))
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=12)
 @given(
     stiffness_n_m=st.floats(300.0, 30_000.0),
     gain=st.floats(0.95, 1.1),
@@ -124,17 +124,16 @@ def test_obstacle_is_reported_one_second_after_the_last_progress(make_run):
     assert stopped.reason.endswith("by an obstacle, or by friction: check gripper.friction_n")
 
 
-@pytest.mark.parametrize("share", [1.3, 1.45])
 @pytest.mark.parametrize("width_m", [0.01, 0.085])
-def test_jaws_that_friction_makes_slow_arrive_and_are_not_blocked(make_run, share, width_m):
-    friction_n = share * make_run().transmission.friction_n
-    run = make_run(plant={**FAR, "friction_n": friction_n}).move(width_m, 15.0)
+def test_jaws_that_friction_makes_slow_arrive_and_are_not_blocked(make_run, width_m):
+    friction_n = 1.45 * make_run().transmission.friction_n
+    run = make_run(plant={**FAR, "friction_n": friction_n}).move(width_m, 0.005).until(has_ended)
     assert run.last.status.outcome == "moved"
 
 
 def test_slow_jaws_are_not_blocked(make_run):
-    run = make_run(plant={**FAR, "friction_n": 0.5}, approach_speed_m_s=0.001).move(OPEN_M - 0.006, 8.0)
-    assert run.last.status.outcome == "moved"
+    run = make_run(plant={**FAR, "friction_n": 0.5}, approach_speed_m_s=0.001).move(OPEN_M - 0.006, 0.005)
+    assert run.until(has_ended).last.status.outcome == "moved"
 
 
 def test_a_noisy_stream_of_moves_onto_an_obstacle_is_blocked(make_run):
@@ -144,13 +143,16 @@ def test_a_noisy_stream_of_moves_onto_an_obstacle_is_blocked(make_run):
     assert any(status.outcome == "blocked" for status in run.statuses)
 
 
-@pytest.mark.parametrize("every", [1, 7, 20])
-def test_a_stream_of_moves_is_as_fast_as_one(make_run, every):
+@pytest.mark.parametrize("every", [1, 20])
+def test_a_repeated_move_is_one(make_run, every):
     run = make_run(plant=FAR)
     for _ in range(round(1.5 / (0.005 * every))):
         run.move(0.04, 0.005 * every)
     assert run.last.status.outcome == "moved"
     assert sum(reason.startswith("move to") for reason in run.reasons) == 1
+
+
+def test_a_stream_of_moves_is_followed(make_run):
     run = make_run(plant=FAR)
     for i in range(1, 201):  # 20 mm/s, slower than the jaws may be
         run.move(OPEN_M - 1e-4 * i, 0.005)
@@ -179,7 +181,7 @@ def test_widths_out_of_range_are_refused(make_run, width_m):
 
 
 def test_refused_move_does_not_end_a_hold(make_run):
-    run = make_run().grasp(4.0, 5.0).move(0.2, 0.5)
+    run = make_run().grasp(4.0).move(0.2, 0.5)
     assert (run.last.status.phase, run.last.status.outcome) == ("hold", "held")
     assert run.plant.force_n == pytest.approx(4.0, abs=0.2)
 
@@ -193,7 +195,7 @@ def test_move_pre_empts_every_phase(make_run, phase):
 
 
 def test_move_resets_the_outcome_and_lets_go(make_run):
-    run = make_run().grasp(4.0, 5.0)
+    run = make_run().grasp(4.0)
     assert run.last.status.outcome == "held"
     run.go(0.005, "move", width_m=0.08)
     assert run.last.status.outcome == ""
@@ -203,7 +205,7 @@ def test_move_resets_the_outcome_and_lets_go(make_run):
 
 
 def test_move_from_a_hold_to_a_narrower_width_relaxes_the_grip(make_run):
-    run = make_run().grasp(8.0, 5.0).move(0.02, 4.0)
+    run = make_run().grasp(8.0).move(0.02, 4.0)
     assert run.last.status.phase == "move"
     # Friction may hold the object compressed above what the motor gives.
     assert run.plant.force_n <= run.config.approach_force_n + 2 * run.plant.friction_n + 0.1
@@ -270,6 +272,6 @@ def test_goal_positions_follow_the_closing_direction(make_run, transmission, clo
 
 
 def test_same_inputs_give_identical_decisions(drawn_run, transmission):
-    run = drawn_run(3).move(0.07, 1.0).grasp(4.0, 4.0).move(0.09, 2.0).move(0.01, 2.0)
+    run = drawn_run(3).move(0.07, 1.0).grasp(4.0).move(0.09, 2.0).move(0.01, 2.0)
     again = GraspController(run.config, transmission, 1.2, POSITION_LOOP)
     assert [again.step(*inputs) for inputs in run.inputs] == run.decisions

@@ -15,7 +15,6 @@ from gripper_force.jobs.score import score_grasp
 from gripper_force.qualification.loop_margin.analytic_plant import POSITION_LOOP
 from gripper_force.types import Request, ServoState, VisualForce
 
-TARGETS_N = (1.0, 2.0, 4.0, 8.0)
 PHASES = ("open", "approach", "contact", "ramp", "hold", "release", "move")
 
 
@@ -25,11 +24,11 @@ def phases(run):
     return [name for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
 
 
-@pytest.mark.parametrize("target_n", TARGETS_N)
+@pytest.mark.parametrize("target_n", [1.0, 8.0])
 def test_fused_feedback_holds_the_target(drawn_run, target_n):
     seen, overshoot, outcomes = [], [], []
     for seed in range(8):
-        run = drawn_run(seed).grasp(target_n, 7.5)
+        run = drawn_run(seed).grasp(target_n, 6.0)
         assert phases(run) == ["approach", "contact", "ramp", "hold"]
         outcomes.append(run.last.status.outcome)
         score = score_grasp(run.cell, run.statuses, target_n)
@@ -62,7 +61,7 @@ def test_approach_identifies_friction_and_limits_the_impact(drawn_run, feedback)
 
 @pytest.mark.parametrize("target_n", [2.0, 8.0])
 def test_current_alone_is_within_friction_and_gearing(drawn_run, target_n):
-    for seed in range(4):
+    for seed in range(3):
         run = drawn_run(seed, feedback="current").grasp(target_n)
         score = score_grasp(run.cell, run.statuses, target_n)
         assert abs(score.steady_error_n) < 0.12 * target_n + 0.2
@@ -70,8 +69,8 @@ def test_current_alone_is_within_friction_and_gearing(drawn_run, target_n):
 
 
 def test_vision_alone_holds(drawn_run):
-    for seed in range(4):
-        run = drawn_run(seed, feedback="vision").grasp(4.0, 8.0)
+    for seed in range(2):
+        run = drawn_run(seed, feedback="vision").grasp(4.0, 6.0)
         score = score_grasp(run.cell, run.statuses, 4.0)
         assert abs(score.steady_n * run.vision.gain - 4.0) < 0.15
         assert run.last.status.outcome == "held"
@@ -132,7 +131,7 @@ def test_slower_jaws_have_more_time(make_run, transmission):
 
 
 def test_a_smaller_force_of_a_held_object_needs_no_time_to_travel(make_run):
-    run = make_run(timeout_s=3.0).grasp(2.0, 4.0)
+    run = make_run(timeout_s=3.0).grasp(2.0)
     assert run.last.status.outcome == "held"
     run.grasp(1e-3, 3.5)  # less than the force can be controlled to
     assert run.last.status.outcome == "timeout"
@@ -143,25 +142,22 @@ def test_a_small_target_without_an_object_is_no_object_and_no_timeout(make_run):
     assert run.last.status.outcome == "no_object"
 
 
-@pytest.mark.parametrize("limit_n", [0.8, 1.0, 1.5, 14.0])
+@pytest.mark.parametrize("limit_n", [0.8, 14.0])
 def test_closed_jaws_open_in_their_time(make_run, limit_n):
     # The first request: no grasp has measured the friction.
     run = make_run(plant={"x_m": 0.044, "jaw_m": 0.044, "contact_m": 1.0}, force_limit_n=limit_n)
-    run.go(run.controller.opening_s, "release")
-    assert run.last.status.phase == "open"
+    run.go(0.005, "release").until(lambda status: status.phase == "open", run.controller.opening_s)
 
 
-@pytest.mark.parametrize("limit_n", [0.8, 1.2, 2.0])
+@pytest.mark.parametrize("limit_n", [0.8, 2.0])
 def test_loss_under_a_small_force_limit_opens_soon(make_run, limit_n):
-    run = make_run(force_limit_n=limit_n, on_slip="open").grasp(0.9 * limit_n / 1.4, 9.0)
-    assert run.last.status.phase == "hold"
+    run = make_run(force_limit_n=limit_n, on_slip="open").grasp(0.9 * limit_n / 1.4, 0.005)
+    run.until(lambda status: status.outcome == "held", 9.0)
     run.plant.contact_m = 1.0
     assert run.go(0.2).last.status.phase == "release"
 
 
-@pytest.mark.parametrize(
-    ("limit_n", "friction", "gain"), [(0.8, 2.0, 1.0), (2.0, 3.0, 1.0), (10.0, 5.0, 0.7)]
-)
+@pytest.mark.parametrize(("limit_n", "friction", "gain"), [(2.0, 3.0, 1.0), (10.0, 5.0, 0.7)])
 def test_a_release_that_cannot_open_the_jaws_is_blocked(make_run, limit_n, friction, gain):
     plant = {"x_m": 0.02, "jaw_m": 0.02, "contact_m": 1.0, "gain": gain}
     plant |= {"friction_n": friction * make_run().transmission.friction_n}
@@ -176,7 +172,7 @@ def test_a_release_that_cannot_open_the_jaws_is_blocked(make_run, limit_n, frict
     # It goes on trying, and another release begins anew.
     assert run.go(0.1, "release").last.status.outcome == ""
     run.plant.friction_n /= friction
-    assert run.go(run.controller.opening_s).last.status.phase == "open"
+    run.until(lambda status: status.phase == "open", run.controller.opening_s)
 
 
 SMALL = {
@@ -191,10 +187,10 @@ SMALL = {
 @pytest.mark.parametrize(("friction", "gain"), [(0.3, 1.4), (0.63, 1.38), (1.0, 1.0)])
 def test_jaws_near_an_object_keep_a_small_force_limit_whatever_is_requested(make_run, friction, gain, then):
     friction_n = friction * make_run().transmission.friction_n
-    # With the friction that once failed each case, else a third of them, in which any two values of parameters meet.
+    # A third of the cases for each friction and request, in which any two values of parameters meet.
     part = ["grasp", "move", "move at once"].index(then)
     for indices in itertools.product(*(range(len(values)) for values in SMALL.values())):
-        if friction != 0.63 and (sum(indices) + (friction < 1.0)) % 3 != part:
+        if (sum(indices) + (friction < 1.0)) % 3 != part:
             continue
         k, limit_n, x_m, gap_m = (values[i] for values, i in zip(SMALL.values(), indices, strict=True))
         plant = {"x_m": x_m, "jaw_m": x_m, "contact_m": x_m + gap_m, "stiffness_n_m": k}
@@ -204,8 +200,8 @@ def test_jaws_near_an_object_keep_a_small_force_limit_whatever_is_requested(make
             approach_speed_m_s=0.029,
             feedback="current",
         )
-        run.grasp(0.6 * limit_n, 0.2 if then == "move at once" else 4.0)
-        run.grasp(0.64 * limit_n, 2.0) if then == "grasp" else run.move(0.02, 2.0)
+        run.grasp(0.6 * limit_n, 0.2 if then == "move at once" else 2.8)
+        run.grasp(0.64 * limit_n, 1.0) if then == "grasp" else run.move(0.02, 1.0)
         peak_n = max(sample.force_n for sample in run.cell)
         # Wide open jaws may come loose with the configured friction (docs/reliability.md).
         share = 1.05 if x_m > 0 else 1.3
@@ -226,13 +222,11 @@ def test_a_release_after_a_stop_lets_a_springy_object_go_slowly(make_run):
     run = make_run(plant={"stiffness_n_m": 970.0, "mass_kg": 0.83}, on_fault="hold").grasp(6.9)
     run.go(0.5, "stop").go(2.0, "release")
     assert run.last.status.phase == "open"
-    opening_m_s = [-state.velocity_rad_s for _, state, _, _ in run.inputs]
-    fastest_m_s = max(abs(v) for v in opening_m_s) * abs(run.transmission.jaw_m_per_rad(0.0))
-    assert fastest_m_s < 1.5 * 2 * run.config.approach_speed_m_s
+    assert max(map(abs, run.speeds_m_s)) < 1.5 * 2 * run.config.approach_speed_m_s
 
 
 def test_no_object(make_run):
-    run = make_run(plant={"contact_m": 1.0}, timeout_s=20.0).grasp(8.0, 4.0)
+    run = make_run(plant={"contact_m": 1.0}, timeout_s=20.0).grasp(8.0)
     assert phases(run)[:2] == ["approach", "release"]
     assert run.last.status.outcome == "no_object"
     run.go(3.0)
@@ -243,12 +237,10 @@ def test_no_object(make_run):
 def lose_object(run, distance_m=1.0, time_s=2.0):
     """Moves the object away. Returns the greatest speed of the jaws and the time until the slip is reported."""
     run.plant.contact_m += distance_m
-    lost, fastest_m_s = len(run.decisions), 0.0
-    for _ in range(round(time_s / 0.005)):
-        run.go(0.005)
-        fastest_m_s = max(fastest_m_s, run.plant.v_m_s)
+    lost = len(run.decisions)
+    run.go(time_s)
     slips = [i for i, status in enumerate(run.statuses) if i >= lost and status.outcome == "slip"]
-    return fastest_m_s, 0.005 * (slips[0] - lost + 1) if slips else math.inf
+    return max(run.speeds_m_s[lost:]), 0.005 * (slips[0] - lost + 1) if slips else math.inf
 
 
 @pytest.mark.parametrize(
@@ -266,7 +258,7 @@ def test_lost_object_is_a_slip_at_bounded_speed(make_run, target_n, phase):
 
 @pytest.mark.parametrize("friction_n", [0.3, 0.95, 1.5])
 def test_slip_after_held_is_reported_within_50_ms(make_run, friction_n):
-    run = make_run(plant={"friction_n": friction_n}).grasp(4.0, 5.0)
+    run = make_run(plant={"friction_n": friction_n}).grasp(4.0)
     assert run.last.status.outcome == "held"
     fastest_m_s, reported_s = lose_object(run)
     assert reported_s <= 0.05
@@ -282,7 +274,7 @@ def test_lost_object_of_a_small_force_is_a_slip_soon(make_run):
 
 
 def test_object_that_leaves_jaws_on_an_end_stop_is_a_slip_with_a_camera(make_run):
-    run = make_run(plant={"stiffness_n_m": 300.0, "stops_m": (0.0, 0.020)}).grasp(1.0, 5.0)
+    run = make_run(plant={"stiffness_n_m": 300.0, "stops_m": (0.0, 0.020)}).grasp(1.0)
     assert run.last.status.outcome == "held"
     run.plant.stops_m = (0.0, run.plant.x_m)
     _, reported_s = lose_object(run)
@@ -295,7 +287,7 @@ def test_force_that_a_camera_sees_before_the_contact_confirms_no_grip(make_run):
     run = make_run(plant={"contact_m": 1.0, "stops_m": (0.0, 0.020)}, timeout_s=3.0)
     sample = run.vision.sample
     run.vision.sample = lambda t_ns, force_n, noise: sample(t_ns, 100.0 * run.plant.x_m, noise)
-    run.grasp(3.0, 4.0)
+    run.grasp(3.0)
     assert run.last.status.outcome == "timeout"
     assert any("the camera sees" in reason and "before the contact" in reason for reason in run.reasons)
 
@@ -311,30 +303,26 @@ def test_unfamiliar_frames_tell_a_grip_from_empty_jaws_on_an_end_stop(make_run, 
         return None if visual is None else replace(visual, std_n=float("inf"))
 
     run.vision.sample = unfamiliar
-    run.grasp(3.0, 4.0)
+    run.grasp(3.0)
     assert run.last.status.outcome == outcome
     assert {decision.estimate.source for decision in run.decisions} == {"current"}
 
 
 def test_camera_that_is_uncertain_throughout_a_grip_prevents_held(make_run):
-    run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0, 4.0)
+    run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0)
     assert run.last.status.outcome == "timeout"
     assert any("the camera is uncertain" in reason for reason in run.reasons)
 
 
 def test_springy_object_cannot_push_the_jaws_open_fast(make_run):
-    run = make_run(plant={"stiffness_n_m": 300.0, "mass_kg": 0.8, "friction_n": 0.3}).grasp(8.0, 5.0)
-    run.go(0.005, "release")
-    fastest_m_s = 0.0
-    for _ in range(300):
-        run.go(0.005)
-        fastest_m_s = max(fastest_m_s, -run.plant.v_m_s)
+    run = make_run(plant={"stiffness_n_m": 300.0, "mass_kg": 0.8, "friction_n": 0.3}).grasp(8.0)
+    run.go(1.5, "release")
     assert run.last.status.phase == "open"
-    assert fastest_m_s < 1.5 * 2 * run.config.approach_speed_m_s
+    assert -min(run.speeds_m_s) < 1.5 * 2 * run.config.approach_speed_m_s
 
 
 def test_after_a_slip_the_jaws_grip_again(make_run):
-    run = make_run(on_slip="regrip").grasp(4.0, 4.0)
+    run = make_run(on_slip="regrip").grasp(4.0)
     lose_object(run, 0.004, 4.0)
     assert run.last.status.outcome == "slip"
     assert run.last.status.phase == "hold"
@@ -342,14 +330,14 @@ def test_after_a_slip_the_jaws_grip_again(make_run):
 
 
 def test_after_a_slip_the_jaws_open_if_there_is_nothing(make_run):
-    run = make_run(on_slip="regrip").grasp(4.0, 4.0)
+    run = make_run(on_slip="regrip").grasp(4.0)
     lose_object(run, 1.0, 8.0)
     assert run.last.status.outcome == "slip"
     assert run.last.status.phase == "open"
 
 
 def test_after_a_slip_the_width_is_held(make_run):
-    run = make_run(on_slip="hold").grasp(4.0, 4.0)
+    run = make_run(on_slip="hold").grasp(4.0)
     lose_object(run, 1.0, 0.05)
     width_m = run.last.status.width_m
     run.go(2.0)
@@ -358,14 +346,14 @@ def test_after_a_slip_the_width_is_held(make_run):
 
 
 def test_after_a_slip_the_jaws_open(make_run):
-    run = make_run(on_slip="open").grasp(4.0, 4.0)
+    run = make_run(on_slip="open").grasp(4.0)
     lose_object(run, 1.0, 3.0)
     assert run.last.status.outcome == "slip"
     assert run.last.status.phase == "open"
 
 
 def test_jaws_that_creep_are_a_slip_without_a_release(make_run):
-    run = make_run().grasp(4.0, 4.0)
+    run = make_run().grasp(4.0)
     for _ in range(500):
         run.plant.contact_m += 0.00001
         run.go(0.005)
@@ -375,50 +363,39 @@ def test_jaws_that_creep_are_a_slip_without_a_release(make_run):
 
 
 @pytest.mark.parametrize("target_n", [1.0, 3.0, 8.0])
-@pytest.mark.parametrize("factor", [2.0, 3.0, 4.0, 5.0])
+@pytest.mark.parametrize("factor", [2.0, 3.0, 5.0])
 @pytest.mark.parametrize("feedback", ["fused", "current"])
 def test_more_friction_than_configured_is_stuck_or_held(make_run, target_n, factor, feedback):
     run = make_run(plant={"friction_n": 0.95 * factor, "contact_m": 0.02}, feedback=feedback)
-    fastest_m_s = watch(run.go(0.005, "grasp", target_n), 6.0)
+    run.grasp(target_n, 6.0)
     assert run.last.status.outcome in ("held", "stuck", "slip", "no_object", "timeout")
     if run.last.status.outcome == "held":
         assert run.plant.force_n == pytest.approx(target_n, rel=0.3)
     assert run.plant.peak_n < 1.05 * run.config.force_limit_n
-    assert fastest_m_s < 1.5 * run.config.approach_speed_m_s
-
-
-def watch(run, time_s):
-    """Returns the greatest closing speed of the jaws."""
-    fastest_m_s = 0.0
-    for _ in range(round(time_s / 0.005)):
-        run.go(0.005)
-        fastest_m_s = max(fastest_m_s, run.plant.v_m_s)
-    return fastest_m_s
+    assert max(run.speeds_m_s) < 1.5 * run.config.approach_speed_m_s
 
 
 @pytest.mark.parametrize("target_n", [1.0, 3.0])
 def test_jaws_that_do_not_move_are_stuck(make_run, target_n):
-    run = make_run(plant={"friction_n": 4.0}).grasp(target_n, 4.0)
+    run = make_run(plant={"friction_n": 4.0}).grasp(target_n)
     assert run.last.status.outcome == "stuck"
     assert run.plant.x_m == 0.0
     assert any("gripper.friction_n" in reason for reason in run.reasons)
 
 
-@pytest.mark.parametrize("configured_n", [2.0, 3.0, 5.0])
-@pytest.mark.parametrize("target_n", [1.0, 4.0, 8.0])
+@pytest.mark.parametrize("configured_n", [2.0, 5.0])
+@pytest.mark.parametrize("target_n", [1.0, 8.0])
 def test_less_friction_than_configured_is_held(make_run, configured_n, target_n):
     transmission = replace(make_run().transmission, friction_n=configured_n)
-    run = make_run(plant={"contact_m": 0.02})
-    run = replace(run, transmission=transmission)
-    fastest_m_s = watch(run.go(0.005, "grasp", target_n), 6.0)
+    run = replace(make_run(plant={"contact_m": 0.02}), transmission=transmission).grasp(target_n)
     assert run.last.status.outcome == "held"
     assert run.plant.force_n == pytest.approx(target_n, abs=0.1 * target_n + 0.1)
     assert run.plant.peak_n < 1.05 * run.config.force_limit_n
-    assert fastest_m_s < 1.5 * run.config.approach_speed_m_s
+    assert max(run.speeds_m_s) < 1.5 * run.config.approach_speed_m_s
 
 
 def test_force_collapse_is_a_slip(make_run):
-    run = make_run(feedback="vision").grasp(4.0, 5.0)
+    run = make_run(feedback="vision").grasp(4.0)
     run.vision.gain = 0.3
     run.spoil = lambda _, servo: replace(servo, current_a=0.0)  # the motor current drops too
     run.go(1.5)
@@ -435,13 +412,13 @@ def test_timeout(make_run):
 def test_timeout_at_the_current_limit_names_it(make_run):
     run = make_run(timeout_s=2.0)
     run.controller = GraspController(run.config, run.transmission, 0.1, POSITION_LOOP)
-    run.grasp(6.0, 4.0)
+    run.grasp(6.0)
     assert run.last.status.outcome == "timeout"
     assert any("check servo.current_limit_a" in reason for reason in run.reasons)
 
 
 def test_retarget_without_letting_go(make_run):
-    run = make_run().grasp(2.0, 4.0).grasp(5.0, 4.0)
+    run = make_run().grasp(2.0).grasp(5.0)
     assert phases(run) == ["approach", "contact", "ramp", "hold", "ramp", "hold"]
     assert run.plant.force_n == pytest.approx(5.0, rel=0.03)
     run.grasp(3.0, 6.0)
@@ -452,29 +429,28 @@ def test_retarget_without_letting_go(make_run):
 
 @pytest.mark.parametrize("first", ["release", "move", "release grasp"])
 def test_a_repeated_release_lets_go_of_a_springy_object_as_slowly_as_one(make_run, first):
-    run = make_run(plant={"stiffness_n_m": 1_700.0, "friction_n": 0.6}, force_limit_n=19.0).grasp(11.0, 5.0)
+    run = make_run(plant={"stiffness_n_m": 1_700.0, "friction_n": 0.6}, force_limit_n=19.0).grasp(11.0)
     for kind in first.split():
         run.go(0.02, kind, 5.0, width_m=0.092)
     for _ in range(50):
         run.go(0.02, "release")
-    speeds_m_s = [abs(servo.velocity_rad_s) * 0.02 for _, servo, _, _ in run.inputs[-300:]]
-    assert max(speeds_m_s) < 1.5 * 2 * run.config.approach_speed_m_s
+    assert max(map(abs, run.speeds_m_s)) < 1.5 * 2 * run.config.approach_speed_m_s
     assert run.last.status.phase == "release" or run.plant.x_m < 0.002
 
 
-@pytest.mark.parametrize("every", [1, 7, 20])
-def test_a_repeated_target_changes_nothing(make_run, every):
-    run, once = make_run(), make_run().grasp(2.0, 4.0).grasp(5.0, 3.0)
-    run.grasp(2.0, 4.0)
-    for i in range(round(3.0 / (0.005 * every))):
-        run.grasp(5.0 + (0.04 if i % 2 else 0.0), 0.005 * every)  # a policy's output has noise
-    assert run.last.status.outcome == "held"
-    assert run.decisions[: len(once.decisions)] == once.decisions[: len(run.decisions)]
+def test_a_repeated_target_changes_nothing(make_run):
+    once = make_run().grasp(2.0, 3.0).grasp(5.0, 3.0)
+    for every in (1, 20):
+        run = make_run().grasp(2.0, 3.0)
+        for i in range(600 // every):
+            run.grasp(5.0 + (0.04 if i % 2 else 0.0), 0.005 * every)  # a policy's output has noise
+        assert run.last.status.outcome == "held"
+        assert run.decisions == once.decisions
 
 
 @pytest.mark.parametrize("feedback", ["fused", "current"])
 def test_a_stream_of_targets_is_followed(make_run, feedback):
-    run = make_run(feedback=feedback).grasp(3.5, 4.0)
+    run = make_run(feedback=feedback).grasp(3.5)
     errors_n = []
     for i in range(240):  # 8 s at 30 Hz
         target_n = 3.5 + 1.5 * math.sin(2 * math.pi * i / 120)
@@ -490,7 +466,7 @@ def test_a_stream_of_targets_is_followed(make_run, feedback):
 @pytest.mark.parametrize(("before_n", "target_n"), [(5.0, 2.0), (8.0, 4.0)])
 def test_lower_target_is_reached_within_half_a_second(drawn_run, feedback, before_n, target_n):
     errors_n = []
-    for seed in range(8):
+    for seed in range(5):
         run = drawn_run(seed, feedback=feedback)
         run.plant.gain = run.vision.gain = 1.0  # errors of the sensors are not errors of the manoeuvre
         run.grasp(before_n, 5.0).grasp(target_n, 0.5)
@@ -503,7 +479,7 @@ def test_lower_target_is_reached_within_half_a_second(drawn_run, feedback, befor
 
 @pytest.mark.parametrize("rate_hz", [5.0, 10.0, 15.0, 20.0, 30.0, 90.0])
 def test_vision_stays_in_use_at_any_frame_rate(make_run, rate_hz):
-    run = make_run(vision={"rate_hz": rate_hz}, vision_rate_hz=rate_hz).grasp(4.0, 6.0)
+    run = make_run(vision={"rate_hz": rate_hz}, vision_rate_hz=rate_hz).grasp(4.0)
     assert not [text for text in run.texts if "ms old" in text or "no new estimate" in text]
     assert "vision in use" in [text for text in run.texts if "vision" in text][-1]
     assert run.last.status.outcome == "held"
@@ -513,7 +489,7 @@ def test_vision_stays_in_use_at_any_frame_rate(make_run, rate_hz):
 @pytest.mark.parametrize("feedback", ["fused", "current"])
 @pytest.mark.parametrize("stiffness_n_m", [250.0, 350.0])
 def test_a_lowering_does_not_lose_a_very_soft_object(make_run, feedback, stiffness_n_m):
-    run = make_run(plant={"stiffness_n_m": stiffness_n_m}, feedback=feedback).grasp(6.0, 6.0)
+    run = make_run(plant={"stiffness_n_m": stiffness_n_m}, feedback=feedback).grasp(6.0)
     held = len(run.cell)
     run.grasp(0.5, 2.0)
     assert "slip" not in [status.outcome for status in run.statuses]
@@ -522,12 +498,12 @@ def test_a_lowering_does_not_lose_a_very_soft_object(make_run, feedback, stiffne
 
 
 def test_vision_removes_the_rest_of_a_lowering(make_run):
-    run = make_run(plant={"stiffness_n_m": 600.0}).grasp(5.0, 5.0).grasp(2.0, 2.0)
+    run = make_run(plant={"stiffness_n_m": 600.0}).grasp(5.0).grasp(2.0, 2.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
 
 def test_new_target_in_contact_is_used(make_run):
-    run = make_run().to_phase("contact").grasp(2.0, 4.0)
+    run = make_run().to_phase("contact").grasp(2.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
 
@@ -553,28 +529,22 @@ def test_jaws_that_lose_their_object_are_not_faster_than_an_approach(make_run, o
     run = make_run(plant={"stiffness_n_m": 5000.0, "gain": gain}, on_slip=on_slip)
     run.grasp(target_n, 2.5)
     run.plant.contact_m = 1.0
-    fastest_m_s = 0.0
-    for _ in range(100):
-        run.go(0.005)
-        fastest_m_s = max(fastest_m_s, run.plant.v_m_s)
+    run.go(0.5)
     assert "slip" in [status.outcome for status in run.statuses]
-    assert fastest_m_s <= 1.4 * run.config.approach_speed_m_s
+    assert max(run.speeds_m_s) <= 1.4 * run.config.approach_speed_m_s
 
 
 def test_soft_object_that_is_pressed_flat_is_let_go_slowly(make_run):
     plant = {"stiffness_n_m": 875.0, "contact_m": 0.036, "friction_n": 0.35}
-    run = make_run(plant=plant, feedback="current").grasp(7.8, 6.0)
+    run = make_run(plant=plant, feedback="current").grasp(7.8)
     assert run.last.status.outcome == "no_object"
-    opening_m_s = []
-    run = make_run(plant=plant | {"contact_m": 0.026}, feedback="current").grasp(7.8, 4.0)
+    run = make_run(plant=plant | {"contact_m": 0.026}, feedback="current").grasp(7.8)
     run.plant.contact_m = 1.0
     run.go(0.1)
     run.plant.contact_m = 0.036
-    for _ in range(600):
-        run.go(0.005)
-        opening_m_s.append(-run.plant.v_m_s)
+    run.go(3.0)
     assert run.last.status.outcome == "slip"
-    assert max(opening_m_s) <= 1.5 * 2 * run.config.approach_speed_m_s
+    assert -min(run.speeds_m_s) <= 1.5 * 2 * run.config.approach_speed_m_s
 
 
 @pytest.mark.parametrize("phase", ["open", "approach", "release", "move"])
@@ -682,7 +652,7 @@ def test_hot_servo_holds_less_and_reports_it(make_run):
 
 @pytest.mark.parametrize("gain", [0.92, 1.08])
 def test_vision_that_reads_low_cannot_exceed_the_limit(make_run, gain):
-    run = make_run(force_limit_n=5.0, plant={"gain": gain}, vision={"gain": 0.6}).grasp(4.4, 6.0)
+    run = make_run(force_limit_n=5.0, plant={"gain": gain}, vision={"gain": 0.6}).grasp(4.4)
     assert max(sample.force_n for sample in run.cell) <= 1.05 * 5.0
 
 
@@ -744,7 +714,7 @@ def test_unknown_requests_are_refused(make_run):
 
 
 def test_too_much_force_lowers_the_current(make_run):
-    run = make_run(force_limit_n=3.0).grasp(2.5, 4.0)
+    run = make_run(force_limit_n=3.0).grasp(2.5)
     before_a = run.last.command.goal_current_a
     run.spoil = lambda _, servo: replace(servo, current_a=0.15)
     run.go(0.3)
@@ -761,7 +731,7 @@ def test_late_cycle_causes_no_jump(make_run):
 
 
 def test_replay_is_bit_for_bit_identical(drawn_run, transmission):
-    run = drawn_run(3).grasp(4.0, 4.0).go(1.0, "release")
+    run = drawn_run(3).grasp(4.0).go(1.0, "release")
     again = GraspController(run.config, transmission, 1.2, POSITION_LOOP)
     assert [again.step(*inputs) for inputs in run.inputs] == run.decisions
 
@@ -823,7 +793,7 @@ def test_paper_is_gripped_with_the_full_force(make_run):
         plant={"contact_m": 0.04585, "stops_m": (0.0, 0.046), "stiffness_n_m": 2e5, "play_m": 0.0},
         min_object_width_m=0.0001,
         feedback="current",
-    ).grasp(9.0)
+    ).grasp(9.0, 6.0)
     assert run.last.status.outcome == "held"
     assert run.plant.force_n == pytest.approx(9.0, abs=0.5)
 
@@ -845,7 +815,7 @@ def test_camera_that_sees_far_too_much_does_not_confirm_jaws_that_friction_holds
 
 
 def regrip(run, target_n):
-    return run.go(2.0, "release").grasp(target_n, 5.0)
+    return run.go(2.0, "release").grasp(target_n)
 
 
 def test_the_gain_of_a_strange_object_is_learned_over_grasps_and_replays_bit_for_bit(make_run, transmission):
@@ -864,12 +834,12 @@ def test_the_gain_of_a_strange_object_is_learned_over_grasps_and_replays_bit_for
 
 
 def test_a_move_between_two_grasps_keeps_what_was_learned(make_run):
-    run = make_run(vision={"gain": 0.5}).grasp(3.0, 6.0).move(0.08, 2.0).grasp(4.0, 4.0)
+    run = make_run(vision={"gain": 0.5}).grasp(3.0).move(0.08, 2.0).grasp(4.0)
     assert run.last.estimate.source == "fused"
 
 
 def test_what_was_learned_of_one_object_is_forgotten_for_another(make_run):
-    run = make_run(vision={"gain": 0.5}).grasp(3.0, 6.0).go(2.0, "release")
+    run = make_run(vision={"gain": 0.5}).grasp(3.0).go(2.0, "release")
     run.inputs.clear()
     decision = run.controller.step(
         run.t_ns, run.plant.read(run.t_ns, 0.0), None, Request(run.t_ns, "grasp", 4.0, new_object=True)
@@ -880,7 +850,7 @@ def test_what_was_learned_of_one_object_is_forgotten_for_another(make_run):
 
 
 def test_a_held_object_can_not_be_a_new_one(make_run):
-    run = make_run().grasp(3.0, 4.0)
+    run = make_run().grasp(3.0)
     servo = run.plant.read(run.t_ns, 0.0)
     decision = run.controller.step(run.t_ns, servo, None, Request(run.t_ns, "grasp", 4.0, new_object=True))
     assert "release before the grasp of a new one" in decision.refusal
