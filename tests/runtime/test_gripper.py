@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import gripper_force as gf
 from gripper_force.control import state_machine
 from gripper_force.control.limits import largest_target_n
-from gripper_force.runtime import control_loop, process
+from gripper_force.runtime import control_loop, process, session
 from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.session import Session
@@ -49,22 +49,24 @@ def simulated(quick: list[str]) -> Iterator[Open]:
         gripper.close()
 
 
+def served_by(server: PtyServer) -> list[str]:
+    """Overrides for a run in real time on a virtual servo, however busy the machine is."""
+    return [
+        "clock=realtime",
+        f"servo.port={server.device_path}",
+        "load_cell.backend=none",
+        "servo.bus_watchdog_ms=2540",
+        "servo.reply_margin_ms=500",
+    ]
+
+
 @pytest.fixture
 def real_time(quick: list[str], server: PtyServer) -> Iterator[Open]:
     """Opens grippers in real time on a virtual servo behind a pseudo-terminal, without an object."""
     opened: list[gf.Gripper] = []
 
     def make(*overrides: str, **options: Any) -> gf.Gripper:
-        sets = [
-            *quick,
-            "clock=realtime",
-            f"servo.port={server.device_path}",
-            "load_cell.backend=none",
-            "servo.bus_watchdog_ms=2540",  # the machine that tests may be busy
-            "servo.reply_margin_ms=500",
-            *overrides,
-        ]
-        opened.append(gf.open_gripper(overrides=sets, **options))
+        opened.append(gf.open_gripper(overrides=[*quick, *served_by(server), *overrides], **options))
         return opened[-1]
 
     yield make
@@ -186,26 +188,98 @@ def test_a_log_can_be_replayed(simulated: Open, tmp_path: Path) -> None:
     assert gf.replay(tmp_path / "run.mcap").identical is True
 
 
-def test_vision_share_counts_the_hold(quick_vision: list[str]) -> None:
-    with gf.open_gripper(overrides=[*quick_vision, "vision.lockstep_compute_ms=1"]) as gripper:
-        assert gripper.frame is not None
-        assert gripper.frame.gray.dtype == "uint8"
-        result = gripper.grasp(3.0)
-        assert 0 <= result.vision_share <= 1
-        assert gripper.config.gripper.nm_per_a is not None  # the resolved configuration
+class NoiseCamera:
+    """A camera of 50 frames per second, of which no two are equal."""
+
+    supports_lockstep = True
+
+    def __init__(self, config: gf.CameraConfig, clock: gf.Clock) -> None:
+        self._clock, self._seq = clock, 0
+
+    def start(self) -> None:
+        pass
+
+    def newest(self) -> gf.Frame | None:
+        now_ns = self._clock.now_ns()
+        if now_ns < 20_000_000 * self._seq:
+            return None
+        self._seq += 1
+        return gf.Frame(now_ns, now_ns, self._seq, np.full((2, 2), self._seq % 251, np.uint8))
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+class LoadCellEstimator:
+    """An estimator that sees a share of the force on the load cell."""
+
+    reference = None
+
+    def __init__(self, share: float) -> None:
+        self.share = share
+        self.gripper: gf.Gripper | None = None  # once it is open
+
+    def update(self, gray: object) -> gf.ForceEstimate:
+        force_n = None if self.gripper is None else self.gripper.state.load_cell_n
+        return gf.ForceEstimate(self.share * (force_n or 0.0), 0.1)
+
+    def attention_map(self) -> None:
+        return None
+
+
+@pytest.fixture
+def open_seeing(simulated: Open, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], gf.Gripper]:
+    """Opens a gripper in lockstep whose visual estimates are a share of the true force."""
+
+    def make(share: float) -> gf.Gripper:
+        estimator = LoadCellEstimator(share)
+        monkeypatch.setattr(session, "make_estimator", lambda _: estimator)
+        estimator.gripper = simulated(
+            f"camera.backend={__name__}:NoiseCamera", "control.feedback=fused", "control.settle_s=0.8"
+        )
+        return estimator.gripper
+
+    return make
+
+
+def test_vision_share_counts_the_hold(open_seeing: Callable[[float], gf.Gripper]) -> None:
+    gripper = open_seeing(1.0)
+    assert gripper.frame is not None
+    assert gripper.frame.gray.dtype == "uint8"
+    assert gripper.grasp(3.0).vision_share > 0.9
+    assert gripper.config.gripper.nm_per_a is not None  # the resolved configuration
+
+
+def test_a_new_object_begins_without_the_gain_of_the_one_before(
+    open_seeing: Callable[[float], gf.Gripper],
+) -> None:
+    gripper = open_seeing(0.7)
+    first = gripper.grasp(3.0)
+    assert first.vision_share == 0  # it contradicts the motor current
+    assert first.object_gain == pytest.approx(1 / 0.7, rel=0.1)
+    with pytest.raises(gf.RequestError, match="an object is held"):
+        gripper.grasp(3.0, new_object=True)
+    gripper.release()
+    assert gripper.grasp(3.0).vision_share > 0.9
+    gripper.release()
+    assert gripper.grasp(3.0, new_object=True).vision_share == 0
 
 
 def test_a_camera_without_reference_frames_is_an_error_before_the_first_motion(
-    quick_vision: list[str],
+    quick_vision: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames that come later may show contact, so they are no reference."""
+    monkeypatch.setattr(session, "_VISION_WAIT_NS", 500_000_000)
     fault = "faults=[{unit: camera, kind: 'off', at_s: 0.03, for_s: 30}]"
-    error = r"no visual estimate after 5.07 s and \d frames; the network needs 4 before the first contact"
+    error = r"no visual estimate after 0.567 s and \d frames; the network needs 4 before the first contact"
     with pytest.raises(gf.DeviceTimeoutError, match=error):
         gf.open_gripper(overrides=[*quick_vision, fault])
-    late = "faults=[{unit: camera, kind: 'off', at_s: 0.03, for_s: 3}]"
+    late = "faults=[{unit: camera, kind: 'off', at_s: 0.03, for_s: 0.3}]"
     with gf.open_gripper(overrides=[*quick_vision, late]) as gripper:
-        assert gripper.state.t_ns > 3e9
+        assert gripper.state.t_ns > 0.3e9
 
 
 @pytest.mark.parametrize("target_n", [0.0, -1.0, 9.1, math.nan, math.inf])
@@ -499,12 +573,16 @@ def test_any_sequence_of_requests_keeps_the_limit_and_ends_without_torque(
 # In real time.
 
 
+NARROW = ("control.approach_speed_m_s=0.05", "gripper.open_width_m=0.03")
+"""Jaws that soon have closed without an object."""
+
+
 def test_the_background_thread_runs_the_cycle(real_time: Open, server: PtyServer) -> None:
-    gripper = real_time()
+    gripper = real_time(*NARROW)
     assert torque(server) == 1
     assert "control" in {thread.name for thread in threading.enumerate()}
     assert gripper.grasp(3.0).outcome == gf.Outcome.NO_OBJECT
-    assert gripper.release() > 0.085
+    assert gripper.release() > 0.026
     with pytest.raises(gf.RequestError, match="open with background=False"):
         gripper.step()
     gripper.sleep(0.01)
@@ -587,10 +665,10 @@ def test_a_newer_request_replaces_a_waiting_one(real_time: Open) -> None:
 def test_a_gripper_is_used_from_threads_other_than_the_main_one(real_time: Open) -> None:
     gripper = real_time()
     results: list[float] = []
-    thread = threading.Thread(target=lambda: results.append(gripper.move(0.06)))
+    thread = threading.Thread(target=lambda: results.append(gripper.move(0.085)))
     thread.start()
     thread.join()
-    assert results == [pytest.approx(0.06, abs=0.001)]
+    assert results == [pytest.approx(0.085, abs=0.001)]
 
 
 def test_numpy_numbers_become_floats(simulated: Open, tmp_path: Path) -> None:
@@ -614,7 +692,7 @@ def test_a_move_in_a_thread_leaves_asyncio_free(real_time: Open) -> None:
     gripper = real_time()
 
     async def main() -> tuple[float, int]:
-        moving = asyncio.create_task(asyncio.to_thread(gripper.move, 0.05))
+        moving = asyncio.create_task(asyncio.to_thread(gripper.move, 0.07))
         reads = 0
         while not moving.done():
             assert gripper.state.t_ns > 0
@@ -623,7 +701,7 @@ def test_a_move_in_a_thread_leaves_asyncio_free(real_time: Open) -> None:
         return await moving, reads
 
     width_m, reads = asyncio.run(main())
-    assert width_m == pytest.approx(0.05, abs=0.001)
+    assert width_m == pytest.approx(0.07, abs=0.001)
     assert reads > 5
 
 
@@ -676,7 +754,7 @@ def test_the_callers_exception_ends_the_run_and_keeps_its_traceback(
     real_time: Open, server: PtyServer
 ) -> None:
     with pytest.raises(ValueError, match="mine") as caught, real_time("on_exit=hold") as gripper:
-        gripper.move(0.06)
+        gripper.move(0.085)
         raise ValueError("mine")
     assert torque(server) == 0
     assert [entry.name for entry in caught.traceback][-1] == (
@@ -707,7 +785,7 @@ def test_close_ends_a_call_that_waits(real_time: Open) -> None:
 @pytest.mark.parametrize("background", [True, False])
 def test_a_stop_just_before_the_end_counts(real_time: Open, server: PtyServer, background: bool) -> None:
     gripper = real_time("on_exit=hold", background=background)
-    gripper.move(0.06)
+    gripper.move(0.085)
     gripper.stop()
     gripper.close()
     assert torque(server) == 0
@@ -715,7 +793,7 @@ def test_a_stop_just_before_the_end_counts(real_time: Open, server: PtyServer, b
 
 def test_a_control_thread_that_hangs_is_an_error(real_time: Open, monkeypatch: pytest.MonkeyPatch) -> None:
     gripper = real_time()
-    monkeypatch.setattr(control_loop, "_END_S", 0.0)
+    monkeypatch.setattr(control_loop, "_END_S", -math.inf)  # does not wait
     monkeypatch.setattr(gripper._loop._closing, "is_set", lambda: False)
     with pytest.raises(gf.DeviceTimeoutError, match="control thread did not end"):
         gripper.close()
@@ -728,7 +806,7 @@ import sys, time
 import gripper_force as gf
 
 gripper = gf.open_gripper(overrides=sys.argv[2:])
-gripper.move(0.06)
+gripper.move(0.085)
 print("ready", flush=True)
 if sys.argv[1] == "wait":
     gripper.sleep(60)
@@ -743,8 +821,7 @@ elif sys.argv[1] == "raise":
 def test_a_program_that_forgets_to_close_leaves_no_torque(
     quick: list[str], server: PtyServer, ending: str, number: signal.Signals | None, code: int
 ) -> None:
-    sets = [*quick, "clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
-    sets += ["servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=500"]
+    sets = [*quick, *served_by(server)]
     if ending == "raise":
         sets += ["on_exit=hold"]  # which is not for exceptions
     with subprocess.Popen(
@@ -804,7 +881,7 @@ def test_a_release_after_a_stop_resets_it(simulated: Open) -> None:
 
 
 def test_a_refused_move_leaves_the_waiting_grasp_alone(real_time: Open) -> None:
-    gripper = real_time("control.approach_speed_m_s=0.05")
+    gripper = real_time("control.approach_speed_m_s=0.05", "gripper.open_width_m=0.06")
     results: list[gf.GraspResult] = []
     waiting = threading.Thread(target=lambda: results.append(gripper.grasp(3.0)))
     waiting.start()
@@ -924,10 +1001,11 @@ def armed(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     return writes
 
 
-def ctrl_c() -> None:
+def ctrl_c(number: signal.Signals = signal.SIGINT) -> None:
+    """Sends a signal to the main thread, as the kernel does."""
     main = threading.main_thread().ident
     assert main is not None
-    signal.pthread_kill(main, signal.SIGINT)
+    signal.pthread_kill(main, number)
 
 
 def wait_until_closing(opening: list[ControlLoop]) -> None:
@@ -1063,8 +1141,7 @@ def test_a_gripper_that_is_lost_is_closed(
     quick: list[str], server: PtyServer, opening: list[ControlLoop]
 ) -> None:
     before = signal.getsignal(signal.SIGINT)
-    sets = [*quick, "clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
-    sets += ["servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=500"]
+    sets = [*quick, *served_by(server)]
     gripper = gf.open_gripper(overrides=sets)
     assert torque(server) == 1
     assert signal.getsignal(signal.SIGINT) != before
@@ -1116,10 +1193,11 @@ def test_a_program_may_ask_for_signals_and_timing(real_time: Open) -> None:
     before, handler = sys.getswitchinterval(), signal.getsignal(signal.SIGTERM)
     gripper = real_time("control.approach_speed_m_s=0.005")
     assert sys.getswitchinterval() < before
-    timer = threading.Timer(0.2, lambda: signal.raise_signal(signal.SIGTERM))
+    timer = threading.Timer(0.2, ctrl_c, [signal.SIGTERM])
     timer.start()
     with pytest.raises(KeyboardInterrupt), gripper:
         gripper.grasp(3.0)
+        pytest.fail("the signal did not end the call that waits")
     timer.join()
     assert sys.getswitchinterval() == pytest.approx(before)
     assert signal.getsignal(signal.SIGTERM) == handler
@@ -1167,13 +1245,11 @@ def test_a_handled_interrupt_is_raised_once(simulated: Open, monkeypatch: pytest
     gripper.close()
 
 
-@pytest.mark.parametrize("background", [False, True])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("number", "background"), [(signal.SIGINT, True), (signal.SIGTERM, False)])
 def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(
     quick: list[str], server: PtyServer, number: signal.Signals, background: bool
 ) -> None:
-    real = ["clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
-    sets = [*quick, *(real if background else [])]
+    sets = [*quick, *(served_by(server) if background else [])]
     done = subprocess.run(
         [sys.executable, "-c", CLOSED_IN_A_THREAD, str(int(number)), *sets],
         capture_output=True,
@@ -1183,21 +1259,3 @@ def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(
     )
     assert done.returncode == -number, done.stderr
     assert done.stdout == ("True\n" if number == signal.SIGINT else "")
-
-
-def test_a_new_object_begins_without_the_gain_of_the_one_before(simulated: Open) -> None:
-    eyes = ("camera.backend=simulated", "vision.checkpoint=small", "control.feedback=fused")
-    gripper = simulated(*eyes, "control.settle_s=0.8", "object=sponge", "sim.stiffness=1.5")
-    first = gripper.grasp(3.0)
-    assert first.object_gain is not None
-    assert first.object_gain > 1.05
-    with pytest.raises(gf.RequestError, match="an object is held"):
-        gripper.grasp(3.0, new_object=True)
-    gripper.release()
-    second = gripper.grasp(3.0)
-    assert second.object_gain is not None
-    # Two grasps are less likely an error of the torque constant.
-    assert second.object_gain > first.object_gain + 0.1
-    gripper.release()
-    other = gripper.grasp(3.0, new_object=True)
-    assert other.object_gain == pytest.approx(first.object_gain, rel=0.05)

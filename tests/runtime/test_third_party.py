@@ -16,7 +16,7 @@ from gripper_force.plugins import load_class
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
-from gripper_force.runtime.session import open_session
+from gripper_force.runtime.session import open_run, open_session
 from gripper_force.types import Event, Frame, GraspStatus, Phase, RequestKind
 from gripper_hw.dynamixel import virtual
 
@@ -209,8 +209,9 @@ def test_a_sensor_that_fails_at_the_end_does_not_hide_the_error_before(
 
 def test_the_settings_of_a_camera_may_be_of_numpy(config: Config, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    run_grasp(with_own(config, "camera", ""), path)
-    assert len(list(LogReader(path).records(Frame))) > 40
+    with open_run(with_own(config, "camera", ""), path) as session:
+        session.wait_for_reference()
+    assert len(list(LogReader(path).records(Frame))) > 10
     settings = json.loads(LogReader(path).attachments["camera.json"])
     assert settings == {"gain": 2.5, "resolution_px": [64, 48], "mode": "day"}
 
@@ -229,8 +230,11 @@ def test_an_attribute_settings_of_a_camera_is_its_own(
 
 
 def test_settings_that_fail_do_not_cost_the_log(config: Config, tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match=r"Camera\.settings\(\) raised ValueError: no settings here"):
-        run_grasp(with_own(config, "camera", "settings"), tmp_path / "run.mcap")
+    with (
+        pytest.raises(DeviceError, match=r"Camera\.settings\(\) raised ValueError: no settings here"),
+        open_run(with_own(config, "camera", "settings"), tmp_path / "run.mcap") as session,
+    ):
+        session.wait_for_reference()
     assert LogReader(tmp_path / "run.mcap").complete
 
 
