@@ -17,6 +17,9 @@ from gripper_force.types import NS_PER_MS, NS_PER_S
 _FIRST_NS: Final = 5 * NS_PER_S
 """Longest start of a sensor: an Arduino restarts when its port is opened."""
 
+_MEASURE_NS: Final = NS_PER_S
+"""Time for which a sensor is measured."""
+
 _POLL_NS: Final = NS_PER_MS
 
 T = TypeVar("T")
@@ -116,7 +119,7 @@ def gather(devices: Devices, take: Callable[[], Iterable[T]]) -> list[T]:
         devices.check()
         new = list(take())
         if new and not items:
-            end_ns = now_ns + NS_PER_S
+            end_ns = now_ns + _MEASURE_NS
         items += new
         clock.sleep_until_ns(now_ns + _POLL_NS)
     return items

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from gripper_force.config import Config
+from gripper_force.jobs import checks
 from gripper_force.jobs.checks import Check
-from gripper_force.types import Frame
+from gripper_force.jobs.dataset import Clip
+from gripper_force.types import NS_PER_S, Frame
 from gripper_hw.cameras import camera_probe as probe
 from gripper_hw.cameras import oak, uvc
 
@@ -20,6 +22,13 @@ def rows(config: dict[str, Any], sysfs: Path = Path("/sys")) -> dict[str, Check]
     return {check.name: check for check in checks if check.name != "listed"}
 
 
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measures for a fifth of a second only."""
+    monkeypatch.setattr(checks, "_MEASURE_NS", NS_PER_S // 5)
+
+
+@pytest.mark.usefixtures("short")
 def test_simulated_camera_is_measured_in_simulated_time() -> None:
     found = rows(QUICK | {"camera": {"rate_hz": 50.0}})
     assert all(check.ok for check in found.values())
@@ -28,6 +37,7 @@ def test_simulated_camera_is_measured_in_simulated_time() -> None:
     assert found["latency"].found == "median 15.0 ms from exposure to use"
 
 
+@pytest.mark.usefixtures("short")
 def test_latency_at_which_a_run_rejects_every_frame_is_a_problem() -> None:
     late = rows(QUICK | {"control": {"vision_age_ms": 10.0}})["latency"]
     assert late.ok is False
@@ -36,12 +46,17 @@ def test_latency_at_which_a_run_rejects_every_frame_is_a_problem() -> None:
     assert rows(QUICK | {"control": {"vision_timeout_ms": 10.0}})["latency"].ok is True
 
 
-def test_rate_of_playback_is_shown(fused_log: Path) -> None:
-    found = rows(REAL | {"camera": {"backend": "playback", "path": str(fused_log), "rate_hz": 1000.0}})
+@pytest.mark.usefixtures("short")
+def test_rate_of_playback_is_shown(
+    write_log: Callable[[Clip, Path], Path], press: Callable[[int], Clip], tmp_path: Path
+) -> None:
+    log = write_log(press(0), tmp_path)
+    found = rows(REAL | {"camera": {"backend": "playback", "path": str(log), "rate_hz": 1000.0}})
     assert found["rate"].ok is True
     assert found["rate"].found.endswith(" Hz of playback")
 
 
+@pytest.mark.usefixtures("short")
 def test_rate_below_configured_is_a_problem(
     make_uvc: Callable[..., uvc.UvcCamera], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -51,6 +66,7 @@ def test_rate_below_configured_is_a_problem(
     assert "set camera.rate_hz to the measured rate" in rate.advice
 
 
+@pytest.mark.usefixtures("short")
 def test_settings_in_force_are_shown(
     make_uvc: Callable[..., uvc.UvcCamera], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,6 +79,7 @@ def test_settings_in_force_are_shown(
     assert settings.found == shown
 
 
+@pytest.mark.usefixtures("short")
 def test_setting_that_the_device_does_not_keep_is_a_problem(
     make_oak: Callable[..., oak.OakCamera], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,6 +90,7 @@ def test_setting_that_the_device_does_not_keep_is_a_problem(
     assert "does not keep camera.gain:" in settings.advice
 
 
+@pytest.mark.usefixtures("short")
 def test_usb_speed_of_oak_is_shown(
     make_oak: Callable[..., oak.OakCamera], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -106,6 +124,6 @@ def test_devices_are_listed_without_a_configured_camera(tmp_path: Path) -> None:
     node = tmp_path / "class/video4linux/video2"
     node.mkdir(parents=True)
     (node / "name").write_text("HD Webcam\n")
-    checks = list(probe.probe(Config.model_validate({"camera": {"backend": "none"}}), tmp_path))
-    assert {check.ok for check in checks} == {None}
-    assert "/dev/video2: HD Webcam" in [check.found for check in checks]
+    listed = list(probe.probe(Config.model_validate({"camera": {"backend": "none"}}), tmp_path))
+    assert {check.ok for check in listed} == {None}
+    assert "/dev/video2: HD Webcam" in [check.found for check in listed]

@@ -107,12 +107,12 @@ class RealCameraContract(CameraContract):
 
 class TestOakCamera(RealCameraContract):
     @pytest.fixture
-    def camera(self, make_oak: Callable[[], OakCamera]) -> Camera:
-        return make_oak()
+    def camera(self, make_oak: Callable[..., OakCamera]) -> Camera:
+        return make_oak(np.zeros((60, 80), np.uint8), timeout_ms=1000)
 
     @pytest.fixture
-    def second_camera(self, make_oak: Callable[[], OakCamera]) -> Camera:
-        return make_oak()
+    def second_camera(self, make_oak: Callable[..., OakCamera]) -> Camera:
+        return make_oak(np.zeros((60, 80), np.uint8), timeout_ms=1000)
 
 
 class TestUvcCamera(RealCameraContract):

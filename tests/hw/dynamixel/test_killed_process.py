@@ -1,6 +1,5 @@
-"""Grasp processes that are killed or stopped in motion; the virtual servos run in other processes."""
+"""Grasp processes that are killed or stopped in motion."""
 
-import json
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
 from gripper_hw.dynamixel.control_table import REGISTERS
 from gripper_hw.dynamixel.packets import Error
+from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 
 COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
@@ -80,16 +80,14 @@ def kill_both(quick: list[str], tmp_path: Path) -> None:
     with ExitStack() as stack:
         ports, children = [], []
         for number in SIGNALS:
-            served = stack.enter_context(process("virtual-servo", "--json"))
-            assert served.stdout is not None
-            ports.append(json.loads(served.stdout.readline())["port"])
+            ports.append(stack.enter_context(serve_virtual_servo("XM430-W350")).device_path)
             folder = tmp_path / number.name
             children.append(stack.enter_context(process(*grasp(ports[-1], folder, quick))))
         for child in children:
             assert child.stderr is not None
             if not any("approach" in line for line in child.stderr):
                 check_busy(child)
-        time.sleep(1.0)  # of motion
+        time.sleep(0.5)  # of motion
         for child in children:
             if child.poll() is not None:
                 check_busy(child)

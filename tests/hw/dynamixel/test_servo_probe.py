@@ -5,11 +5,13 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from dynamixel_sdk import protocol2_packet_handler
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
 from gripper_force.jobs.checks import RegisterChange, SetupResult
 from gripper_hw import UDEV_RULES
+from gripper_hw.dynamixel import servo_probe
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR
 from gripper_hw.dynamixel.packets import Instruction
@@ -21,6 +23,12 @@ pytestmark = pytest.mark.parametrize("make_endpoint", ["pty"], indirect=True)
 
 READS = {Instruction.PING, Instruction.READ, Instruction.FAST_SYNC_READ}
 MODEL = load_model("XM430-W350")
+
+
+@pytest.fixture(autouse=True)
+def shorter_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets a scan wait for the answers of 60 servos: the SDK waits 0.8 s for all that a bus may have."""
+    monkeypatch.setattr(protocol2_packet_handler, "MAX_ID", 60)
 
 
 def config_of(endpoint, **servo) -> Config:
@@ -116,14 +124,15 @@ def test_servo_without_replies_is_distinguished_from_a_missing_one(endpoint):
     assert "Status Return Level" in check.advice
 
 
-def test_replies_too_late_for_a_run_are_still_measured(endpoint):
+def test_replies_too_late_for_a_run_are_still_measured(endpoint, monkeypatch):
     def late(answer):
         time.sleep(0.01)
         return answer
 
+    monkeypatch.setattr(servo_probe, "_CYCLES", 10)
     endpoint.bus.tamper = late
     cycle = rows(endpoint, reply_margin_ms=1.0)["servo 1", "bus cycle"]
-    assert cycle.found.endswith(" of 200 reads")
+    assert cycle.found.endswith(" of 10 reads")
 
 
 @pytest.mark.parametrize(("name", "apart"), [("XM430-W350", 0), ("XL330-M288", 10)])

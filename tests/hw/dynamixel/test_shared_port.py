@@ -5,7 +5,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import pytest
-from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
+from dynamixel_sdk import (
+    COMM_SUCCESS,
+    GroupSyncRead,
+    GroupSyncWrite,
+    PacketHandler,
+    PortHandler,
+    port_handler,
+)
 
 import gripper_force as gf
 from gripper_force.errors import (
@@ -93,7 +100,8 @@ class SharedBus:
 
 
 @pytest.fixture
-def shared() -> Iterator[SharedBus]:
+def shared(monkeypatch: pytest.MonkeyPatch) -> Iterator[SharedBus]:
+    monkeypatch.setattr(port_handler, "LATENCY_TIMER", 250)  # of the arm's program, on a busy machine
     gripper = BenchMotor(VirtualServo(GRIPPER, load_model("XM430-W350")))
     arm = [BenchMotor(VirtualServo(id_, load_model("XM540-W270"))) for id_ in ARM]
     with PtyServer(bus := RecordingBus([gripper, *arm])) as server:

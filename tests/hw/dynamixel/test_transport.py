@@ -44,8 +44,16 @@ DAMAGES = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(
+    ("damage", "count", "make_endpoint"),
+    [
+        *((damage, count, "memory") for damage in DAMAGES for count in (1, 2)),
+        ("silence", 2, "pty"),
+        ("truncated", 1, "pty"),
+        ("noise", 1, "pty"),
+    ],
+    indirect=["make_endpoint"],
+)
 def test_damaged_reply_is_retried_and_counted(opened, damage, count):
     endpoint, transport = opened
     endpoint.bus.tamper = first(count, DAMAGES[damage])
@@ -55,7 +63,11 @@ def test_damaged_reply_is_retried_and_counted(opened, damage, count):
     assert transport.stats.timeouts + transport.stats.corrupt == count
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize(
+    ("damage", "make_endpoint"),
+    [*((damage, "memory") for damage in DAMAGES), ("silence", "pty"), ("corrupt", "pty")],
+    indirect=["make_endpoint"],
+)
 def test_persistent_damage_is_a_timeout(opened, damage):
     endpoint, transport = opened
     endpoint.bus.tamper = DAMAGES[damage]

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -6,6 +7,8 @@ import pytest
 from gripper_force.config import Config
 from gripper_force.jobs import checks
 from gripper_force.jobs.checks import Check
+from gripper_force.jobs.dataset import Clip
+from gripper_force.types import NS_PER_S
 from gripper_hw.load_cells.load_cell_probe import probe
 
 REAL = {"clock": "realtime", "servo": {"port": "/dev/nowhere"}}
@@ -23,6 +26,13 @@ def test_simulated_load_cell_is_measured_in_simulated_time() -> None:
     assert found["rejected"].found.startswith("0 of ")
 
 
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measures for a fifth of a second only."""
+    monkeypatch.setattr(checks, "_MEASURE_NS", NS_PER_S // 5)
+
+
+@pytest.mark.usefixtures("short")
 def test_board_on_serial_port_is_measured(board) -> None:
     section = board.config().model_dump(mode="json")
     found = rows(REAL | {"load_cell": section})
@@ -31,6 +41,7 @@ def test_board_on_serial_port_is_measured(board) -> None:
     assert "noise" in found
 
 
+@pytest.mark.usefixtures("short")
 def test_load_cell_without_scale_is_a_problem(board) -> None:
     section = board.config(n_per_raw=None).model_dump(mode="json")
     found = rows(REAL | {"load_cell": section})
@@ -55,6 +66,9 @@ def test_no_load_cell_is_no_problem() -> None:
     }
 
 
-def test_playback_is_measured(fused_log: Path) -> None:
-    section = {"backend": "playback", "path": str(fused_log)}
+@pytest.mark.usefixtures("short")
+def test_playback_is_measured(
+    write_log: Callable[[Clip, Path], Path], press: Callable[[int], Clip], tmp_path: Path
+) -> None:
+    section = {"backend": "playback", "path": str(write_log(press(0), tmp_path))}
     assert rows(REAL | {"camera": {"backend": "none"}, "load_cell": section})["rejected"].ok is True

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
@@ -87,6 +87,7 @@ def wave(period: float, top_n: float) -> Floats:
     return forces_n
 
 
+@settings(max_examples=50)
 @given(
     st.one_of(
         st.builds(ramp, st.floats(0.1, 30.0), st.floats(0.0, 60.0)),
@@ -106,6 +107,7 @@ def test_smooth_forces_are_never_rejected(
     assert [s.force_n for s in taken] == pytest.approx(list(force_n), abs=1e-5)
 
 
+@settings(max_examples=50)
 @given(st.integers(1, 58), st.floats(3.0, 500.0), st.sampled_from([-1, 1]), batches)
 def test_only_the_spike_within_a_hold_is_rejected(index: int, height_n: float, sign: int, every: int) -> None:
     force_n = np.full(60, 5.0) + 0.02 * np.sin(np.arange(60))

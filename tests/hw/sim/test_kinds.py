@@ -87,13 +87,12 @@ def test_training_and_held_out_kinds_are_many_and_cover_each_family() -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_each_kind_fits_between_the_jaws_at_any_size(name: str, squeeze: Callable[[float], Motor]) -> None:
-    for seed in (1, 2):
-        scene = draw_scene(name, seed, WIDE)
-        assert scene == draw_scene(name, seed, WIDE)
-        text, assets = scene_mjcf(scene, GRIPPER)
-        assert (text, assets) == scene_mjcf(scene, GRIPPER)
-        World(replace(scene, size=1.15), GRIPPER, squeeze(0), 1.0, seed, textured=False)
-        mujoco.MjModel.from_xml_string(text, assets)
+    scene = draw_scene(name, 1, WIDE)
+    assert scene == draw_scene(name, 1, WIDE)
+    text, assets = scene_mjcf(scene, GRIPPER)
+    assert (text, assets) == scene_mjcf(scene, GRIPPER)
+    World(replace(scene, size=1.15), GRIPPER, squeeze(0), 1.0, 1, textured=False)
+    mujoco.MjModel.from_xml_string(text, assets)
 
 
 @pytest.mark.parametrize("stiffness", [0.5, 2.0])
@@ -121,8 +120,9 @@ def test_a_stiffer_object_gives_way_less(name: str) -> None:
             mujoco.mj_step(model, data)
         return float(data.joint("right").qpos[0])
 
-    assert closed_m(0.5) - closed_m(1.0) > 0.001
-    assert closed_m(1.0) - closed_m(2.0) > 0.0005
+    soft_m, plain_m, stiff_m = (closed_m(stiffness) for stiffness in (0.5, 1.0, 2.0))
+    assert soft_m - plain_m > 0.001
+    assert plain_m - stiff_m > 0.0005
 
 
 def test_every_attribute_of_a_kind_changes_its_body() -> None:

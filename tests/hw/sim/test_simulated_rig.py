@@ -25,7 +25,7 @@ def make_rig(quick: list[str]) -> Iterator[MakeRig]:
     rigs: list[SimulatedRig] = []
 
     def make(*overrides: str) -> SimulatedRig:
-        config = load_config(None, [*quick, "camera.backend=simulated", *overrides])
+        config = load_config(None, [*quick, "camera.backend=simulated", "camera.rate_hz=20", *overrides])
         rigs.append(SimulatedRig(config))
         rigs[-1].config = config  # type: ignore[attr-defined]
         return rigs[-1]
@@ -266,7 +266,7 @@ def test_light_sets_brightness_and_noise_sets_variance() -> None:
 
 def test_the_true_state_is_observed_at_each_step(make_rig: MakeRig) -> None:
     fault = "faults=[{unit: plant, kind: off, at_s: 0.3}]"
-    rig = make_rig(fault, "gripper.open_width_m=0.066")  # near the object
+    rig = make_rig(fault, "gripper.open_width_m=0.066", "camera.rate_hz=1")  # near the object
     seen: list[WorldState] = []
     rig.observe_world(seen.append)
     squeeze(rig)
@@ -281,7 +281,7 @@ def test_the_true_state_is_observed_at_each_step(make_rig: MakeRig) -> None:
 
 def test_the_true_open_width_is_not_the_believed_one(make_rig: MakeRig) -> None:
     def contact_rad(*keys: str) -> float:
-        states, _, samples = squeeze(make_rig("sim.randomise=false", *keys))
+        states, _, samples = squeeze(make_rig("sim.randomise=false", "camera.rate_hz=1", *keys))
         return states[next(i for i, s in enumerate(samples) if s.force_n > 0.5)].position_rad
 
     radius_m = 0.02

@@ -1,18 +1,19 @@
-import os
-import subprocess
-import sys
-
 import pytest
 
 from gripper_force.config import Config
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, SimulationError
+from gripper_force.jobs import doctor
 from gripper_force.jobs.checks import Check
+from gripper_hw.sim import world
+from gripper_hw.sim.engine import NO_EGL
 from gripper_hw.sim.simulation_probe import probe
 from gripper_hw.sim.world import World
 
+CHEAP = {"object": "stapler", "sim": {"detail": "coarse"}}
+
 
 def test_scene_is_rendered() -> None:
-    (check,) = probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}}))
+    (check,) = probe(Config.model_validate(CHEAP))
     assert (check.unit, check.name, check.ok) == ("simulation", "EGL", True)
     assert check.found.startswith("renders 16x16 pixels of 'stapler'")
 
@@ -26,20 +27,19 @@ def test_every_timed_image_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
         return render(world, side)
 
     monkeypatch.setattr(World, "render", counted)
-    list(probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}})))
+    list(probe(Config.model_validate(CHEAP)))
     assert len(set(times_ns)) == len(times_ns) > 3
 
 
-def test_missing_egl_gives_advice() -> None:
-    code = (
-        "from gripper_force import config\nfrom gripper_force.jobs import doctor\n"
-        "doctor.PROBES = {'simulation': 'gripper_hw.sim.simulation_probe'}\n"
-        "print(next(doctor.doctor(config.Config())))"
-    )
-    env = {**os.environ, "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
-    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
-    assert "ok=False" in done.stdout
-    assert "advice='on Debian or Ubuntu: apt-get install libegl1" in done.stdout
+def test_missing_egl_gives_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise SimulationError(NO_EGL)
+
+    monkeypatch.setattr(world, "new_renderer", refuse)
+    monkeypatch.setattr(doctor, "PROBES", {"simulation": "gripper_hw.sim.simulation_probe"})
+    check = next(doctor.doctor(Config.model_validate(CHEAP)))
+    assert check.ok is False
+    assert check.advice.startswith("on Debian or Ubuntu: apt-get install libegl1")
 
 
 def test_simulation_is_not_checked_without_a_simulated_camera() -> None:
