@@ -187,10 +187,11 @@ SMALL = {
 @pytest.mark.parametrize(("friction", "gain"), [(0.3, 1.4), (0.63, 1.38), (1.0, 1.0)])
 def test_jaws_near_an_object_keep_a_small_force_limit_whatever_is_requested(make_run, friction, gain, then):
     friction_n = friction * make_run().transmission.friction_n
-    # A third of the cases for each friction and request, in which any two values of parameters meet.
+    # A third of the cases for each friction and request, in which any two values of parameters meet; of the request
+    # and friction that found the most, all.
     part = ["grasp", "move", "move at once"].index(then)
     for indices in itertools.product(*(range(len(values)) for values in SMALL.values())):
-        if (sum(indices) + (friction < 1.0)) % 3 != part:
+        if (friction, then) != (0.63, "move at once") and (sum(indices) + (friction < 1.0)) % 3 != part:
             continue
         k, limit_n, x_m, gap_m = (values[i] for values, i in zip(SMALL.values(), indices, strict=True))
         plant = {"x_m": x_m, "jaw_m": x_m, "contact_m": x_m + gap_m, "stiffness_n_m": k}
@@ -201,7 +202,7 @@ def test_jaws_near_an_object_keep_a_small_force_limit_whatever_is_requested(make
             feedback="current",
         )
         run.grasp(0.6 * limit_n, 0.2 if then == "move at once" else 2.8)
-        run.grasp(0.64 * limit_n, 1.0) if then == "grasp" else run.move(0.02, 1.0)
+        run.grasp(0.64 * limit_n, 1.0) if then == "grasp" else run.move(0.02, 2.0)
         peak_n = max(sample.force_n for sample in run.cell)
         # Wide open jaws may come loose with the configured friction (docs/reliability.md).
         share = 1.05 if x_m > 0 else 1.3
