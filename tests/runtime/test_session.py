@@ -211,12 +211,13 @@ def test_a_seed_gives_one_log_with_vision(fused_log: Path, quick_vision: list[st
     again = records(path)
     end = next(i for i, record in enumerate(again) if record == status)
     assert again[:end] == records(fused_log)[:end]
-    for kind in (Frame, AttentionMap):
-        images = list(LogReader(path).records(kind))
-        assert len(images) > 40
-        for image, first in zip(images, LogReader(fused_log).records(kind), strict=False):
-            assert (image.seq, image.t_ns) == (first.seq, first.t_ns)
-            assert (image.gray == first.gray).all()
+    log, whole = LogReader(path), LogReader(fused_log)
+    pairs: list[tuple[Frame | AttentionMap, Frame | AttentionMap]] = [
+        *zip(log.records(Frame), whole.records(Frame), strict=False),
+        *zip(log.records(AttentionMap), whole.records(AttentionMap), strict=False),
+    ]
+    assert len(pairs) > 80
+    assert all((a.seq, a.t_ns) == (b.seq, b.t_ns) and (a.gray == b.gray).all() for a, b in pairs)
 
 
 def test_the_log_says_what_ran(fused_log: Path, tiny_checkpoint: Path) -> None:
