@@ -211,6 +211,8 @@ def small_recipe() -> TrainConfig:
     return TrainConfig(
         attentions=("ssam",),
         width=0.25,
+        hidden=16,
+        head=24,
         preprocess=Preprocess(size=16),
         steps=4,
         clips=3,

@@ -77,9 +77,10 @@ def _main() -> None:
     checkpoint, path = map(Path, sys.argv[1:])
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the caller may ignore it
     threading.Thread(target=_end_with_caller, daemon=True).start()
-    exporter = import_module("gripper_force.vision.export")  # the caller does not need PyTorch
     try:
-        exporter.export(read_model(checkpoint), path)
+        model = read_model(checkpoint)  # first: PyTorch takes seconds to load
+        exporter = import_module("gripper_force.vision.export")  # the caller does not need PyTorch
+        exporter.export(model, path)
     except GripperError as error:
         sys.exit(f"{type(error).__name__}: {' '.join(str(error).split())}")
 

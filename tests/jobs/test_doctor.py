@@ -22,6 +22,11 @@ def sets(quick_vision: list[str]) -> list[str]:
     return [part for one in (*quick_vision, *patient) for part in ("--set", one)]
 
 
+@pytest.fixture(autouse=True)
+def _short_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_SLEEP_MS", 0)
+
+
 def run(*arguments: object, answer: str = "") -> Result:
     return CliRunner().invoke(cli.app, ["doctor", *map(str, arguments)], input=answer)
 

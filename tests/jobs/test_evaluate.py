@@ -85,6 +85,7 @@ def test_estimates_equal_the_streaming_estimators(checkpoint: Checkpoint, tmp_pa
     assert sum(b.frames for b in result.per_bin) == result.frames
 
 
+@pytest.mark.usefixtures("pool_here")
 def test_logs_are_evaluated_like_their_clips(
     few_logs: Path, tiny_checkpoint: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -115,9 +116,9 @@ def test_files_of_an_evaluation_may_be_named_by_text(
         evaluate(few_logs, tiny_checkpoint, plot=5)  # type: ignore[arg-type]
 
 
-def test_bfloat16_rounds_the_estimates_a_little(few_logs: Path) -> None:
+def test_bfloat16_rounds_the_estimates_a_little(few_logs: Path, tiny_checkpoint: Path) -> None:
     errors = [
-        evaluate(few_logs, "small", config=Config().with_values(vision={"precision": precision}))
+        evaluate(few_logs, tiny_checkpoint, config=Config().with_values(vision={"precision": precision}))
         for precision in ("float32", "bfloat16")
     ]
     assert 0 < abs(errors[0].rmse_n - errors[1].rmse_n) < 0.01 * errors[0].rmse_n

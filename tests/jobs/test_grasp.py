@@ -112,6 +112,7 @@ def grasped(overrides: list[str], folder: Path) -> GraspSummary:
     return grasp_module.grasp(load_config(None, [*overrides, *options]))
 
 
+SLOW_CAMERA = "camera.rate_hz=20"
 NOT_FINITE = "faults=[{unit: estimator, kind: garbage, at_s: 0}]"
 
 
@@ -135,7 +136,7 @@ def test_a_camera_that_stops_during_the_hold_costs_vision_the_rest_of_it(
 
 @pytest.mark.parametrize("feedback", ["vision", "fused"])
 def test_a_hold_without_vision_fell_back(quick_vision: list[str], tmp_path: Path, feedback: str) -> None:
-    summary = grasped([*quick_vision, NOT_FINITE, f"control.feedback={feedback}"], tmp_path)
+    summary = grasped([*quick_vision, SLOW_CAMERA, NOT_FINITE, f"control.feedback={feedback}"], tmp_path)
     assert (summary["feedback"], summary["vision_share"], summary["fell_back"]) == (feedback, 0.0, True)
     assert [loss.reason for loss in summary["vision_losses"]] == ["it is not finite"]
     assert summary["steady_error_n"] is not None
@@ -146,7 +147,7 @@ def test_a_hold_without_vision_fell_back(quick_vision: list[str], tmp_path: Path
 def test_motor_current_alone_has_no_share_of_vision(
     quick: list[str], quick_vision: list[str], tmp_path: Path
 ) -> None:
-    for overrides in (quick, [*quick_vision, "control.feedback=current"]):
+    for overrides in (quick, [*quick_vision, SLOW_CAMERA, "control.feedback=current"]):
         summary = grasped(overrides, tmp_path)
         assert (summary["vision_share"], summary["vision_losses"], summary["fell_back"]) == (None, [], False)
 

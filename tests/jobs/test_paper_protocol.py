@@ -53,6 +53,11 @@ def scenes(instances: str) -> dict[str, list[Scene]]:
     return found
 
 
+def approaches(path: Path) -> int:
+    phases = [s.phase for s in LogReader(path).records(GraspStatus)]
+    return sum(a != b == Phase.APPROACH for a, b in pairwise(phases))
+
+
 def without_pose(scene: Scene) -> Scene:
     return replace(scene, offset_m=(0.0, 0.0), yaw_deg=0.0)
 
@@ -77,6 +82,7 @@ def test_peaks_of_the_stapler_overshoot_little(seeing: Config, tmp_path: Path, i
     )
     (path,) = make_set(task, tmp_path, seeing.model_dump(mode="json"))
     assert 8.0 < max(s.force_n for s in LogReader(path).records(LoadCellSample)) <= 12.75
+    assert approaches(path) == 4
 
 
 def test_a_set_with_too_high_a_peak_is_refused(
@@ -104,7 +110,10 @@ def records(path: Path) -> list[Record]:
     return [r for r in LogReader(path).records() if not isinstance(r, Frame)]
 
 
-def test_lights_of_a_set_share_one_simulation(seeing: Config, tmp_path: Path) -> None:
+def test_lights_of_a_set_share_one_simulation(
+    seeing: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "TOUCHES", 2)
     tree = seeing.model_dump(mode="json")
     task = SetPlan("stapler", 20, 13, 700_000, (350, 550, 750))
     (tmp_path / "alone").mkdir()
@@ -124,22 +133,24 @@ def test_lights_of_a_set_share_one_simulation(seeing: Config, tmp_path: Path) ->
     assert np.array_equal([f.gray for f in other.records(Frame)], bright)
     forces_n = [s.force_n for s in LogReader(paths[0]).records(LoadCellSample)]
     assert max(forces_n) > 1.0
-    phases = [s.phase for s in LogReader(paths[0]).records(GraspStatus)]
-    assert sum(a != b == Phase.APPROACH for a, b in pairwise(phases)) == 4
     made = config_from_text(logs[2].config, "the log").sim
     assert (made.lux, made.yaw_deg, made.tool) == (750, 20, "rods")
 
 
+@pytest.mark.usefixtures("pool_here")
 def test_only_missing_logs_are_made_and_failed_draws_are_repeated(
     seeing: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(module, "TOUCHES", 1)
     run, seeds = module._run_set, []
 
     def break_once(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) -> None:
         seeds.append(seed)
-        run(config, task, seed, logs)
         if len(seeds) == 1:
+            for log in logs.values():
+                log.write_bytes(b"half a log")
             raise SimulationError("the object caught on a pad")
+        run(config, task, seed, logs)
 
     monkeypatch.setattr(module, "_run_set", break_once)
     task = SetPlan("stapler", 0, 1, 5, (350, 550))

@@ -126,7 +126,7 @@ def write_grasp(
 ) -> Path:
     """A plausible grasp: control at 100 Hz, camera at 30 Hz, load cell at 100 Hz; without vision from ``lost_s`` on."""
     rng = np.random.default_rng(0)
-    vision = {"checkpoint": str(checkpoint or "nowhere.safetensors"), "threads": 1}
+    vision = {"checkpoint": str(checkpoint or "nowhere.safetensors"), "engine": "torch", "threads": 1}
     given = {"object": "paper_cup", "target_n": TARGET_N, "vision": vision, **(REAL if real else {})}
     config = config_from(given, "the test")
     records: list[tuple[int, Record]] = []
@@ -239,18 +239,22 @@ def page(grasp: Path) -> str:
     return write_report(grasp).html.read_text(encoding="utf-8")
 
 
-def test_report_is_written_next_to_log_or_into_folder(grasp: Path, page: str) -> None:
+@pytest.fixture
+def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty figure instead of the drawn one, which takes seconds."""
+    monkeypatch.setattr(report_module, "draw", lambda *_: Figure())
+
+
+@pytest.mark.usefixtures("page")
+def test_report_is_written_next_to_its_log(grasp: Path) -> None:
     assert grasp.with_suffix(".html").is_file()
     image = cv2.imread(str(grasp.with_suffix(".png")))
     assert image is not None
     assert image.shape[1] >= 1200
-    paths = write_report(grasp, grasp.parent / "elsewhere")
-    assert paths.png.parent == paths.html.parent == grasp.parent / "elsewhere"
-    assert paths.html.read_text(encoding="utf-8") == page, "the same log gives the same page"
 
 
-def test_log_is_read_and_figure_is_drawn_once(
-    grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_report_in_another_folder_is_the_same_and_is_read_and_drawn_once(
+    grasp: Path, page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     times_ns, drawn = [], []
 
@@ -265,7 +269,9 @@ def test_log_is_read_and_figure_is_drawn_once(
 
     monkeypatch.setattr(log_reader_module, "breakup_chunk", count)
     monkeypatch.setattr(report_module, "draw", kept)
-    write_report(grasp, tmp_path)
+    paths = write_report(grasp, tmp_path / "elsewhere")
+    assert paths.png.parent == paths.html.parent == tmp_path / "elsewhere"
+    assert paths.html.read_text(encoding="utf-8") == page
     assert len(times_ns) == len(set(times_ns)) > 50
     assert len(drawn) == 1
 
@@ -335,6 +341,7 @@ def test_current_width_and_temperature_are_drawn(grasp: Path) -> None:
     assert "Motor, 31 to 34 °C" in titles
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_a_simulated_run_says_so_and_shows_no_simulated_latency(tmp_path: Path) -> None:
     page = write_report(write_grasp(tmp_path / "simulated.mcap", real=False)).html.read_text(encoding="utf-8")
     text = Page(page).text
@@ -343,6 +350,7 @@ def test_a_simulated_run_says_so_and_shows_no_simulated_latency(tmp_path: Path) 
     assert [entry for entry in text if entry.startswith("Estimator, per frame")]
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_each_touch_of_several_has_a_card(tmp_path: Path) -> None:
     path = tmp_path / "touches.mcap"
     with LogWriter(path, config=dump_config(config_from({"object": "egg"}, "")), metadata={}) as log:
@@ -534,12 +542,14 @@ def test_report_of_recording_without_a_run(tmp_path: Path) -> None:
     assert sum(source.startswith("data:") for source in parsed.sources) == 6
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_report_of_empty_log(tmp_path: Path) -> None:
     path = tmp_path / "empty.mcap"
     LogWriter(path, config="", metadata={}).close()
     assert "Sponge" in Page(write_report(path).html.read_text(encoding="utf-8")).text
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_truncated_log_is_reported_with_recover(grasp: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(grasp.read_bytes()[: grasp.stat().st_size // 2])
@@ -548,6 +558,7 @@ def test_truncated_log_is_reported_with_recover(grasp: Path, tmp_path: Path) -> 
     assert write_report(cut, recover=True).html.is_file()
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_report_that_cannot_be_written_raises(tmp_path: Path) -> None:
     log = write_recording(tmp_path / "egg.mcap")
     (tmp_path / "file").touch()

@@ -9,7 +9,7 @@ import pytest
 from gripper_force.errors import CheckpointError
 from gripper_force.vision.export_process import export_apart
 from gripper_force.vision.header import Model
-from gripper_force.vision.model_files import exported_file, read_model
+from gripper_force.vision.model_files import cache_folder, exported_file, exported_name, read_model
 
 
 @pytest.fixture
@@ -26,7 +26,18 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_the_export_has_no_effect_on_this_process(
+def test_the_file_of_an_engine_is_made_in_the_cache(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("openvino")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = exported_file(model, ".xml")
+    assert path == cache_folder() / exported_name(model, ".xml")
+    again = read_model(path)
+    assert (again.header, again.digest) == (model.header, model.digest)
+
+
+def test_the_process_runs_once_and_has_no_effect_on_this_one(
     model: Model,
     program: Path,
     tmp_path: Path,
@@ -34,11 +45,12 @@ def test_the_export_has_no_effect_on_this_process(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     program.write_text(
-        '#!/bin/sh\necho step 1\necho a warning >&2\nfor last; do :; done\necho "$*" > "$last"'
+        '#!/bin/sh\necho step 1\necho a warning >&2\nfor last; do :; done\necho "$*" >> "$last"'
     )
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "gripper-force").mkdir()
     path = exported_file(model, ".onnx")
+    assert exported_file(model, ".onnx") == path
     assert path.read_text() == f"-P -m gripper_force.vision.export_process {model.path} {path}\n"
     assert capfd.readouterr() == ("", "")
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gripper_force.config import load_config
 from gripper_force.errors import DataError, UnfamiliarFrameError
-from gripper_force.jobs.simulate import plan, simulate
+from gripper_force.jobs.simulate import SimulationPlan, make_log
 from gripper_force.qualification import recognition
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, Gray
@@ -72,8 +72,8 @@ def test_moderate_light_change_passes(gain: float) -> None:
 @pytest.fixture(scope="module")
 def press(tmp_path_factory: pytest.TempPathFactory) -> Gray:
     """Frames of a simulated sponge, pressed, (T, 128, 128)."""
-    plans = plan("tap", 1, 904_100, ("sponge",))
-    (path,) = simulate(plans, tmp_path_factory.mktemp("tap"), load_config(None, []), workers=1)
+    config = load_config(None, ["sim.detail=coarse"]).model_dump(mode="json")
+    path = make_log(SimulationPlan("tap", "sponge", 904_100), tmp_path_factory.mktemp("tap"), config)
     return np.stack([frame.gray for frame in LogReader(path).records(Frame)])
 
 

@@ -29,6 +29,7 @@ ALL = [SLOW, FAST, LEAN, SMALL]
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(step_benchmark, "_STEPS", 5)
+    monkeypatch.setattr(step_benchmark, "_WARM_UP_STEPS", 1)
     resolve_auto.cache_clear()
     engine_version.cache_clear()
     return tmp_path / "gripper-force" / "engines.json"
@@ -116,6 +117,7 @@ def test_torch_threads_are_the_programs_own(
         return engine
 
     monkeypatch.setattr(selection, "open_engine", open_and_note)
+    monkeypatch.setattr(selection, "step_times_ms", lambda _: (1.0, 2.0))
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(3)

@@ -90,7 +90,7 @@ def test_environment_gives_one_log_per_four_touches(environment: Path, tmp_path:
 
 def test_last_sets_are_for_test(tmp_path: Path) -> None:
     folder = write_environment(tmp_path / "db" / "sponge_0_50", touches(4 * 15))
-    assert import_environment(folder, tmp_path / "out").logs == 15
+    assert import_environment(folder, tmp_path / "out", size=16).logs == 15
     assert len(list((tmp_path / "out" / "train").iterdir())) == 12
     test = sorted(path.stem for path in (tmp_path / "out" / "test").iterdir())
     assert test == ["sponge_0_50-13", "sponge_0_50-14", "sponge_0_50-15"]

@@ -18,6 +18,7 @@ from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
+    NS_PER_MS,
     NS_PER_S,
     Frame,
     GraspStatus,
@@ -156,8 +157,10 @@ def test_board_that_is_silent_at_first_is_waited_for(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As one that resets when its port is opened."""
+    monkeypatch.setattr(module, "_SILENT_NS", 300 * NS_PER_MS)
+    monkeypatch.setattr(module, "FIRST_SAMPLE_NS", NS_PER_S)
     drain = SimulatedLoadCell.drain
-    boots_ns = 3 * NS_PER_S
+    boots_ns = NS_PER_S // 2
 
     def late(cell: SimulatedLoadCell) -> list[LoadCellSample]:
         return [sample for sample in drain(cell) if sample.t_ns > cell._start_ns + boots_ns]
@@ -165,7 +168,7 @@ def test_board_that_is_silent_at_first_is_waited_for(
     monkeypatch.setattr(SimulatedLoadCell, "drain", late)
     (path,) = made(config, RecordingPlan(1, 1, 3.0), tmp_path)
     boots_ns = 10 * NS_PER_S
-    with pytest.raises(DeviceError, match=r"no valid sample for 5 s in set 1 \(rejected: none\)"):
+    with pytest.raises(DeviceError, match=r"no valid sample for 1 s in set 1 \(rejected: none\)"):
         made(config, RecordingPlan(1, 1, 3.0), tmp_path / "again")
     first = next(iter(LogReader(path).records(Request)))
     assert next(iter(LogReader(path).records(LoadCellSample))).t_ns < first.t_ns
@@ -239,11 +242,11 @@ def test_touch_that_load_cell_does_not_measure_raises(
 
 def test_sets_of_an_object_file_that_was_changed_are_not_mixed(config: Config, tmp_path: Path) -> None:
     file = tmp_path / "foam.yaml"
-    text = "family: solid\nsize_m: [0.05, 0.05, 0.05]\nmodulus_pa: 30000\n"
+    text = "family: solid\nsize_m: [0.05, 0.05, 0.05]\nmodulus_pa: 200000\n"
     file.write_text(text)
     own = config.with_values(object="foam", sim={"object": file})
     list(record(own, RecordingPlan(1, touches=1, peak_n=3, test_every=None), tmp_path / "out"))
-    file.write_text(text.replace("30000", "60000"))
+    file.write_text(text.replace("200000", "300000"))
     with pytest.raises(DataError, match=r"file has changed between .*foam-01\.mcap and .*foam-02\.mcap"):
         list(record(own, RecordingPlan(2, touches=1, peak_n=3, test_every=None), tmp_path / "out"))
 

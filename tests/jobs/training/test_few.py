@@ -19,6 +19,7 @@ from gripper_force.jobs.training.stated_errors import errors, labelled_estimates
 from gripper_force.jobs.training.train import train
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.engines.pytorch import restored_threads
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.export import export
 from gripper_force.vision.header import GaussianProcessConfig
@@ -27,17 +28,19 @@ from gripper_force.vision.model_files import read_model
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def six(press: Callable[..., Clip]) -> list[Clip]:
     """Six recordings of six objects."""
     return [replace(press(seed), object=f"o{seed}") for seed in range(6)]
 
 
-@pytest.fixture
-def process(six: list[Clip], tmp_path: Path) -> Path:
-    config = recipe("few", ["preprocess.size=16"])
-    train(config, six, tmp_path / "few.safetensors")
-    return tmp_path / "few.safetensors"
+@pytest.fixture(scope="session")
+def process(six: list[Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("few") / "few.safetensors"
+    with restored_threads():
+        torch.set_num_threads(1)  # before `one_thread` does
+        train(recipe("few", ["preprocess.size=16"]), six, path)
+    return path
 
 
 def test_one_image_throughout_is_named(six: list[Clip]) -> None:
@@ -74,7 +77,7 @@ def test_a_network_trains_on_six_recordings_of_six_objects(
     six: list[Clip], tmp_path: Path, small_recipe: TrainConfig
 ) -> None:
     config = small_recipe.model_copy(update={"validation": 0.1})
-    header = train(config, six, tmp_path / "network.safetensors").header
+    header = train(config, six, tmp_path / "network.safetensors", figure=False).header
     assert header.metrics["constant_mae_n"] > 0
     with pytest.raises(DataError, match="two"):
         train(config, six[:1], tmp_path / "network.safetensors")
@@ -91,7 +94,7 @@ def test_a_stream_equals_the_batch(process: Path, press: Callable[..., Clip]) ->
     assert all(e.std_n > 0 for e in found)
 
 
-def test_the_stored_process_is_the_fitted_one(six: list[Clip], process: Path) -> None:
+def test_the_stored_process_is_the_fitted_one(six: list[Clip], process: Path, tmp_path: Path) -> None:
     config = recipe("few", ["preprocess.size=16"])
     fitted = few.fit(six, config.preprocess).model
     (loaded,) = load_checkpoint(process).networks
@@ -99,17 +102,17 @@ def test_the_stored_process_is_the_fitted_one(six: list[Clip], process: Path) ->
     assert loaded.config == fitted.config
     for name, tensor in fitted.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], tensor), name
-    again = process.with_name("again.safetensors")
+    again = tmp_path / "again.safetensors"
     train(config, six, again)
     assert again.read_bytes() == process.read_bytes()
 
 
 @pytest.mark.parametrize(("suffix", "package"), [(".onnx", "onnxruntime"), (".xml", "openvino")])
 def test_an_exported_process_gives_the_same_forces(
-    suffix: str, package: str, process: Path, press: Callable[..., Clip]
+    suffix: str, package: str, process: Path, press: Callable[..., Clip], tmp_path: Path
 ) -> None:
     pytest.importorskip(package)
-    exported = process.with_suffix(suffix)
+    exported = tmp_path / f"few{suffix}"
     assert export(read_model(process), exported)["largest_n"] < 1e-3
     frames = press(51).frames
     plain, other = ForceEstimator.load(process), ForceEstimator.load(exported, engine=package)
@@ -149,14 +152,17 @@ def test_sets_of_two_objects_may_have_one_name(six: list[Clip]) -> None:
     assert len(few.fit(two, recipe("few", ["preprocess.size=16"]).preprocess).forces_n) == 2
 
 
-def test_keys_of_networks_are_refused(six: list[Clip], process: Path, small_recipe: TrainConfig) -> None:
+def test_keys_of_networks_are_refused(
+    six: list[Clip], process: Path, tmp_path: Path, small_recipe: TrainConfig
+) -> None:
+    out = tmp_path / "out.safetensors"
     with pytest.raises(ConfigError, match="a Gaussian process has no steps"):
         recipe("few", ["steps=5"])
     config = recipe("few", ["preprocess.size=16"])
     with pytest.raises(ConfigError, match="without --init and --replay"):
-        train(config, six, process, replay_clips=six)
+        train(config, six, out, replay_clips=six)
     with pytest.raises(ConfigError, match="is a Gaussian process"):
-        train(small_recipe, six, process, init=load_checkpoint(process))
+        train(small_recipe, six, out, init=load_checkpoint(process))
 
 
 def test_a_network_of_the_recipe_few_can_be_evaluated(few_logs: Path, tmp_path: Path) -> None:
@@ -165,13 +171,14 @@ def test_a_network_of_the_recipe_few_can_be_evaluated(few_logs: Path, tmp_path: 
     done = CliRunner().invoke(cli.app, [*call, "--jobs", "1", "--json"])
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["mae_n"] < json.loads(done.stdout)["constant_mae_n"]
-    told = CliRunner().invoke(cli.app, ["evaluate", str(few_logs), "--checkpoint", str(out), "--json"])
+    call = ["evaluate", str(few_logs), "--checkpoint", str(out), "--jobs", "1", "--json"]
+    told = CliRunner().invoke(cli.app, call)
     assert json.loads(told.stdout)["mae_n"] < 1
 
 
 def test_init_keeps_batch_statistics(six: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
-    first = train(small_recipe, six, tmp_path / "first.safetensors")
-    second = train(small_recipe, six, tmp_path / "second.safetensors", init=first)
+    first = train(small_recipe, six, tmp_path / "first.safetensors", figure=False)
+    second = train(small_recipe, six, tmp_path / "second.safetensors", init=first, figure=False)
     (a,), (b,) = first.networks, second.networks
     moved = {name for name, tensor in a.state_dict().items() if not torch.equal(tensor, b.state_dict()[name])}
     assert any("weight" in name for name in moved)
@@ -184,13 +191,13 @@ def test_replayed_objects_are_not_forgotten(
     # The new object shows the opposite: less change, more force.
     old = [press(seed) for seed in range(6)]
     new = [replace(clip, forces_n=8 - clip.forces_n, object="new") for clip in (press(20), press(21))]
-    config = small_recipe.model_copy(update={"steps": 100, "clips": 6})
-    first = train(config, old, tmp_path / "first.safetensors")
+    config = small_recipe.model_copy(update={"steps": 60, "clips": 4, "precision": "float32"})
+    first = train(config, old, tmp_path / "first.safetensors", figure=False)
     again = config.model_copy(update={"steps": 40})
     errors_n = {}
     for name, replay in (("alone", []), ("replayed", old)):
         out = tmp_path / f"{name}.safetensors"
-        after = train(again, new, out, validation_clips=new, init=first, replay_clips=replay)
+        after = train(again, new, out, validation_clips=new, init=first, replay_clips=replay, figure=False)
         errors_n[name] = mae_n(after, old)
     before_n = mae_n(first, old)
     assert errors_n["alone"] > 2 * before_n
@@ -203,11 +210,11 @@ def test_too_few_steps_warn(
     warnings: list[str] = []
     config = small_recipe.model_copy(update={"steps": 8})
     out = tmp_path / "out.safetensors"
-    train(config, six, out, validation_clips=six, warn=warnings.append)
+    train(config, six, out, validation_clips=six, figure=False, warn=warnings.append)
     (text,) = (w for w in warnings if "out-of-distribution" not in w)
     assert "only 8 steps" in text
     monkeypatch.setattr(train_module, "MIN_STEPS", 8)
-    train(config, six, out, validation_clips=six, warn=warnings.append)
+    train(config, six, out, validation_clips=six, figure=False, warn=warnings.append)
     assert not [w for w in warnings[2:] if "out-of-distribution" not in w]
 
 

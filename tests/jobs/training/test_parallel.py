@@ -1,5 +1,6 @@
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -10,47 +11,57 @@ import torch
 
 from gripper_force.errors import ConfigError
 from gripper_force.jobs.training.parallel import TrainingProcess, join_training_processes
+from gripper_force.jobs.training.train import train
+from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.vision.checkpoint import load_checkpoint
 
 SCRIPT = Path(__file__).with_name("train_together.py")
 
 
-def test_two_processes_train_like_one(tmp_path: Path) -> None:
-    launches = {
-        "one": [sys.executable],
-        "two": [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"],
-    }
-    running = []
-    for name, launch in launches.items():
-        (tmp_path / name).mkdir()
-        command = [*launch, str(SCRIPT), str(tmp_path / name)]
-        running.append(subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}))
+@pytest.mark.usefixtures("one_thread")
+def test_two_processes_train_like_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen([*torchrun, str(SCRIPT), str(tmp_path)], env=environment)
     try:
-        assert [process.wait(timeout=240) for process in running] == [0, 0]
+        one = losses_of_one(tmp_path / "one.safetensors", monkeypatch)
+        assert process.wait(timeout=240) == 0
     finally:
-        for process in running:
-            process.terminate()  # torchrun passes it on
-            process.wait()
+        process.terminate()  # torchrun passes it on
+        process.wait()
 
-    one, first, second = (
-        json.loads((tmp_path / name).read_text()) for name in ("one/0.json", "two/0.json", "two/1.json")
-    )
-    assert len(one["whole"]) == 8
-    assert first["whole"] == pytest.approx(one["whole"], rel=1e-3)
-    assert first["whole"][0] == pytest.approx(one["whole"][0], rel=1e-6)
+    first, second = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in (0, 1))
+    assert len(one) == 8
+    assert first["whole"] == pytest.approx(one, rel=1e-3)
+    assert first["whole"][0] == pytest.approx(one[0], rel=1e-6)
     assert first["whole"] == second["whole"] == first["resumed"] == second["resumed"]
-    whole = (tmp_path / "two/whole.safetensors").read_bytes()
-    assert whole == (tmp_path / "two/resumed.safetensors").read_bytes()
+    whole = (tmp_path / "whole.safetensors").read_bytes()
+    assert whole == (tmp_path / "resumed.safetensors").read_bytes()
     weights = [
         torch.cat([t.flatten() for t in load_checkpoint(tmp_path / name).networks[0].state_dict().values()])
-        for name in ("one/whole.safetensors", "two/whole.safetensors")
+        for name in ("one.safetensors", "whole.safetensors")
     ]
     np.testing.assert_allclose(weights[0], weights[1], rtol=0.01, atol=1e-3)
-    assert not one["refused"]
     assert "different recipes, data or states" in first["refused"]
     assert first["refused"] == second["refused"]
     assert first["left"]
     assert second["left"]
+
+
+def losses_of_one(out: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Trains in this process as the script does. Returns the loss of each step."""
+    script = runpy.run_path(str(SCRIPT))
+    losses: list[float] = []
+    update = Trainer._update
+
+    def spying(trainer: Trainer) -> torch.Tensor:
+        loss = update(trainer)
+        losses.append(loss.item())
+        return loss
+
+    monkeypatch.setattr(Trainer, "_update", spying)
+    train(script["CONFIG"], [script["clip"](seed) for seed in range(6)], out, figure=False)
+    return losses
 
 
 def test_one_process_needs_no_others() -> None:

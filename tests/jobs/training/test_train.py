@@ -15,6 +15,7 @@ from gripper_force import cli
 from gripper_force.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, digest, load_clips
+from gripper_force.jobs.report.plots import draw_training
 from gripper_force.jobs.training import train as train_module
 from gripper_force.jobs.training.recipe import TrainConfig, recipe
 from gripper_force.jobs.training.train import train
@@ -26,10 +27,18 @@ from gripper_force.vision.preprocess import Preprocess
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@pytest.fixture(autouse=True)
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """Stands in for the drawing of the figure, which takes longer than these trainings."""
+    stub = Mock()
+    monkeypatch.setattr(train_module, "draw_training", stub)
+    return stub
+
+
 def test_training_reduces_the_error(
     clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig, press: Callable[..., Clip]
 ) -> None:
-    config = small_recipe.model_copy(update={"steps": 120, "clips": 8})
+    config = small_recipe.model_copy(update={"steps": 60, "clips": 6, "precision": "float32"})
     checkpoint = train(config, clips, tmp_path / "out.safetensors")
     unseen = press(99)
     error = predict(checkpoint.networks, config.preprocess, unseen.frames)[0] - unseen.forces_n
@@ -38,8 +47,9 @@ def test_training_reduces_the_error(
 
 
 def test_checkpoint_holds_data_digest_and_metrics(
-    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
 ) -> None:
+    monkeypatch.setattr(train_module, "draw_training", draw_training)
     config = small_recipe.model_copy(update={"attentions": ("ssam", "scam")})
     out = tmp_path / "folder" / "out.safetensors"
     header = train(config, clips, out).header
@@ -52,8 +62,16 @@ def test_checkpoint_holds_data_digest_and_metrics(
     assert sorted(out.parent.iterdir()) == [out.with_suffix(".png"), out]
 
 
-@pytest.mark.parametrize("attention", ["none", "ssam", "scam", "se", "cbam"])
-@pytest.mark.parametrize(("backbone", "pooling"), [("vgg", "gap"), ("resnet18", "wap"), ("mobile", "wap")])
+@pytest.mark.parametrize(
+    ("attention", "backbone", "pooling"),
+    [
+        ("none", "vgg", "gap"),
+        ("ssam", "resnet18", "wap"),
+        ("scam", "mobile", "gap"),
+        ("se", "vgg", "wap"),
+        ("cbam", "resnet18", "wap"),
+    ],
+)
 def test_every_network_trains(
     attention: str, backbone: str, pooling: str, clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
 ) -> None:
@@ -115,7 +133,7 @@ def test_same_seed_gives_identical_checkpoints(
 
 
 def test_resumed_training_gives_the_same_result(
-    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig, drawn: Mock
 ) -> None:
     config = small_recipe.model_copy(update={"attentions": ("ssam", "scam")})
     whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
@@ -129,8 +147,6 @@ def test_resumed_training_gives_the_same_result(
             raise KeyboardInterrupt
         return update(trainer)
 
-    drawn = Mock()
-    monkeypatch.setattr(train_module, "draw_training", drawn)
     monkeypatch.setattr(Trainer, "_update", failing)
     with pytest.raises(KeyboardInterrupt):
         train(config, clips, broken)
@@ -142,7 +158,6 @@ def test_resumed_training_gives_the_same_result(
     losses = drawn.call_args.args[0]
     assert set(losses) == {"1, ssam", "2, scam"}
     assert losses["1, ssam"][0, 0] == 0, "the error before the interruption is drawn, too"
-    assert whole.with_suffix(".png").is_file()
 
 
 def test_training_too_short_for_all_recordings_warns(
@@ -186,12 +201,15 @@ def interrupt_step(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     monkeypatch.setattr(Trainer, "_update", interrupted)
 
 
+SMALL = ["preprocess.size=16", "width=0.25", "hidden=16", "head=24", "device=cpu"]
+
+
 def test_command_tells_what_to_do_next(
     few_logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out.safetensors"
     call = ["train", str(few_logs), "--out", str(out), "--jobs", "1"]
-    keys = ["preprocess.size=16", "attentions=[none]", "steps=3", "clips=1", "short_share=0", "device=cpu"]
+    keys = [*SMALL, "attentions=[none]", "steps=3", "clips=1", "short_share=0"]
     call += [part for key in keys for part in ("--set", key)]
     refused = CliRunner().invoke(cli.app, [*call, "--resume"]).exception
     assert isinstance(refused, ConfigError)
@@ -274,7 +292,7 @@ def test_command_takes_several_folders_and_a_teacher(
     out = tmp_path / "out.safetensors"
     call = ["train", str(other), str(few_logs), "--out", str(out), "--jobs", "1", "--json"]
     call += ["--teacher", str(tiny_checkpoint)]
-    keys = ["preprocess.size=32", "attentions=[none]", "width=0.25", "steps=1", "device=cpu"]
+    keys = [*SMALL, "preprocess.size=32", "attentions=[none]", "steps=1"]
     call += [part for key in keys for part in ("--set", key)]
     done = CliRunner().invoke(cli.app, call)
     assert done.exit_code == 0, done.output
@@ -303,7 +321,7 @@ def test_command_leaves_out_logs_that_start_in_contact(
         for logs in (sorted(set(few_logs.glob("*.mcap")) - {loaded_log}), few_logs)
     )
     call = ["train", str(few_logs), "--out", str(out), "--jobs", "1", "--json"]
-    keys = ["preprocess.size=16", "attentions=[none]", "width=0.25", "steps=1", "device=cpu"]
+    keys = [*SMALL, "attentions=[none]", "steps=1"]
     call += [part for key in keys for part in ("--set", key)]
     for options, left_out, clips in (
         ([], 1, free),
@@ -353,7 +371,7 @@ def test_data_without_contact_or_split_raise(
 
 def test_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.safetensors"
-    keys = ["preprocess.size=16", "attentions=[cbam]", "epochs=null", "steps=1", "clips=2", "device=cpu"]
+    keys = [*SMALL, "attentions=[cbam]", "epochs=null", "steps=1", "clips=2"]
     sets = [part for key in keys for part in ("--set", key)]
     call = ["train", str(few_logs), "--recipe", "shin2019", "--out", str(out), "--jobs", "1", *sets, "--json"]
     told = json.loads(CliRunner().invoke(cli.app, call).stdout)

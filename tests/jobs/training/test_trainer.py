@@ -14,8 +14,7 @@ from gripper_force.jobs.training.parallel import TrainingProcess
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
 from gripper_force.jobs.training.trainer import Trainer, one_cycle, squared_error, step_decay
-from gripper_force.vision.batch_inference import normalise, predict
-from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.batch_inference import normalise
 from gripper_force.vision.header import NetworkConfig
 from gripper_force.vision.network import ForceNetwork
 
@@ -73,30 +72,37 @@ def test_shared_windows_give_the_loss_and_gradients_of_separate_ones(
 def test_every_precision_and_window_mode_trains(
     precision: str, windows: str, clips: list[Clip], small_recipe: TrainConfig
 ) -> None:
-    recipe = {"precision": precision, "windows": windows, "short_share": 0.0, "steps": 40}
+    recipe = {"precision": precision, "windows": windows, "short_share": 0.0, "steps": 21}
     config = small_recipe.model_copy(update=recipe)
     trainer = Trainer(config, 0, Batches(clips, config, TrainingProcess("cpu")), TrainingProcess("cpu"))
     errors_n = list(trainer.steps())
-    assert len(errors_n) == 40
+    assert len(errors_n) == 21
     assert errors_n[-1] < 0.95 * errors_n[0]
     assert not trainer.network.training
     assert all(p.dtype == torch.float32 for p in trainer.network.parameters())
 
 
-@pytest.mark.parametrize(("flags", "same"), [("avx512_bf16 amx_bf16", "bfloat16"), ("avx2", "float32")])
+@pytest.mark.parametrize(
+    ("flags", "same", "other"),
+    [("avx512_bf16 amx_bf16", "bfloat16", "float32"), ("avx2", "float32", "bfloat16")],
+)
 def test_automatic_precision_is_the_one_that_the_cpu_computes(
-    flags: str, same: str, clips: list[Clip], small_recipe: TrainConfig, monkeypatch: pytest.MonkeyPatch
+    flags: str,
+    same: str,
+    other: str,
+    clips: list[Clip],
+    small_recipe: TrainConfig,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(cpu, "cpu_info", lambda: ["processor: 0", f"flags: fpu {flags} sse2"])
     process = TrainingProcess("cpu")
 
     def errors_n(precision: str) -> list[float]:
-        config = small_recipe.model_copy(update={"precision": precision, "steps": 11})
+        config = small_recipe.model_copy(update={"precision": precision, "steps": 1})
         return list(Trainer(config, 0, Batches(clips, config, process), process).steps())
 
     assert small_recipe.precision == "auto"
-    assert errors_n("auto") == errors_n(same)
-    assert errors_n("bfloat16") != errors_n("float32")
+    assert errors_n("auto") == errors_n(same) != errors_n(other)
 
 
 @pytest.fixture
@@ -109,8 +115,9 @@ def indented(clips: list[Clip]) -> list[Clip]:
 def test_indentation_and_contact_are_learned_beside_force(
     indented: list[Clip], small_recipe: TrainConfig, press: Callable[..., Clip]
 ) -> None:
-    extra = {"indentation_weight": 0.5, "contact_weight": 0.05, "steps": 90, "clips": 8}
-    config = small_recipe.model_copy(update=extra)
+    extra = {"indentation_weight": 0.5, "contact_weight": 0.1, "steps": 90, "clips": 4}
+    network_size = {"hidden": 128, "head": 512}
+    config = small_recipe.model_copy(update={**extra, **network_size, "precision": "float32"})
     trainer = Trainer(config, 0, Batches(indented, config, TrainingProcess("cpu")), TrainingProcess("cpu"))
     list(trainer.steps())
     network, unseen = trainer.network, press(99)
@@ -161,25 +168,29 @@ def test_frozen_statistics_are_those_of_the_initial_network(
     assert not torch.equal(trainer.network.out.weight, weight)
 
 
-def test_teacher_is_imitated(
-    clips: list[Clip], small_recipe: TrainConfig, press: Callable[..., Clip]
-) -> None:
-    """A teacher that says twice the measured force: the student learns its forces and not the labels."""
-    config = small_recipe.model_copy(update={"steps": 60, "clips": 8, "teacher_share": 1.0})
-    batches = Batches(clips, config, TrainingProcess("cpu"))
-    first = Trainer(config, 0, batches, TrainingProcess("cpu"))
-    list(first.steps())
-    with torch.no_grad():
-        first.network.out.weight.mul_(2)
-        first.network.out.bias.mul_(2)
-    teacher = first.network.requires_grad_(False)
-    student = Trainer(config.model_copy(update={"seed": 7}), 0, batches, TrainingProcess("cpu"), [teacher])
-    list(student.steps())
-    unseen = press(99)
-    taught_n = predict([teacher], config.preprocess, unseen.frames)[0]
-    learned_n = predict([student.network], config.preprocess, unseen.frames)[0]
-    assert np.abs(learned_n - taught_n).mean() < 0.25 * np.abs(taught_n - taught_n.mean()).mean()
-    assert np.abs(learned_n - taught_n).mean() < 0.5 * np.abs(learned_n - unseen.forces_n).mean()
+class Teacher(torch.nn.Module):
+    """Says of each frame how much it differs from the reference."""
+
+    def forward(self, inputs: torch.Tensor, start: int) -> torch.Tensor:
+        return inputs[:, start:].abs().mean((2, 3, 4))
+
+
+def test_forces_of_a_teacher_are_learned_like_labels(clips: list[Clip], small_recipe: TrainConfig) -> None:
+    unchanged = {"shift_px": 0, "light": 0.0, "noise": 0.0, "contact_share": 0.0, "force_share": 0.0}
+    config = small_recipe.model_copy(update={**unchanged, "teacher_share": 0.7, "steps": 11})
+    process = TrainingProcess("cpu")
+
+    def errors_n(labelled: list[Clip], *teachers: Teacher) -> list[float]:
+        batches = Batches(labelled, config, process)
+        return list(Trainer(config, 0, batches, process, teachers).steps())  # type: ignore[arg-type]
+
+    mixed = []
+    for clip in clips:
+        frames = torch.from_numpy(clip.frames)[None]
+        taught_n = Teacher()(normalise(frames, frames[:, :4], config.preprocess), 0)[0].numpy()
+        mixed.append(replace(clip, forces_n=np.float32(0.3) * clip.forces_n + np.float32(0.7) * taught_n))
+    assert errors_n(clips, Teacher()) == pytest.approx(errors_n(mixed), rel=1e-3)
+    assert errors_n(clips, Teacher()) != pytest.approx(errors_n(clips), rel=0.05)
 
 
 def test_training_in_parts(clips: list[Clip], small_recipe: TrainConfig) -> None:
@@ -213,7 +224,7 @@ def test_time_budget_ends_training(
         return update(trainer)
 
     monkeypatch.setattr(Trainer, "_update", spying)
-    train(small_recipe.model_copy(update={"minutes": 0.5}), clips, tmp_path / "out.safetensors")
+    train(small_recipe.model_copy(update={"minutes": 0.5}), clips, tmp_path / "out.safetensors", figure=False)
     assert len(learning_rates) > 4
     assert learning_rates == sorted(learning_rates)
     assert learning_rates[0] == 0
@@ -227,19 +238,6 @@ def test_learning_rate_rises_then_falls() -> None:
     assert values[100] == pytest.approx(0, abs=1e-9)
     assert values[:26] == sorted(values[:26])
     assert values[25:] == sorted(values[25:], reverse=True)
-
-
-def test_network_is_as_good_in_evaluation_mode_as_in_training(
-    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
-) -> None:
-    config = small_recipe.model_copy(update={"steps": 60, "clips": 8})
-    train(config, clips, tmp_path / "out.safetensors")
-    (network,) = load_checkpoint(tmp_path / "out.safetensors").networks
-    inputs, forces_n, *_ = Batches(clips, config, TrainingProcess("cpu")).batch(1000, 8, 22)
-    with torch.no_grad():
-        evaluated = (network(inputs, 19) - forces_n[:, 19:]).abs().mean()
-        trained = (network.train()(inputs, 19) - forces_n[:, 19:]).abs().mean()
-    assert evaluated < 2 * trained + 0.2
 
 
 def test_learning_rate_of_the_paper_falls_every_30_of_120_epochs() -> None:

@@ -1,4 +1,4 @@
-"""Script of `test_parallel`, run alone and under torchrun: trains on synthetic clips and writes each loss."""
+"""Script of `test_parallel`, run under torchrun: trains on synthetic clips and writes each loss."""
 
 import json
 import os
@@ -43,7 +43,7 @@ CONFIG = TrainConfig(
 
 
 def main() -> None:
-    folder, rank = Path(sys.argv[1]), int(os.environ.get("RANK", "0"))
+    folder, rank = Path(sys.argv[1]), int(os.environ["RANK"])
     torch.set_num_threads(1)
     train_module.STATE_EVERY_S = 0.0  # type: ignore[misc]
     losses: list[float] = []
@@ -59,13 +59,13 @@ def main() -> None:
 
     Trainer._update = spying  # type: ignore[assignment, method-assign]
     clips = [clip(seed) for seed in range(6)]
-    train(CONFIG, clips, folder / "whole.safetensors")
+    train(CONFIG, clips, folder / "whole.safetensors", figure=False)
     whole, losses = losses, []
     break_at = 3
     with suppress(KeyboardInterrupt):
-        train(CONFIG, clips, folder / "resumed.safetensors")
+        train(CONFIG, clips, folder / "resumed.safetensors", figure=False)
     break_at = -1
-    train(CONFIG, clips, folder / "resumed.safetensors", resume=True)
+    train(CONFIG, clips, folder / "resumed.safetensors", resume=True, figure=False)
     resumed, refused = losses, ""
     try:
         train(CONFIG, clips[rank:], folder / "refused.safetensors")
