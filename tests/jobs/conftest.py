@@ -16,7 +16,7 @@ class _PoolHere(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
-        sent = processes.answer(ForkingPickler.dumps((fn, args, kwargs)))
+        sent = processes.answer(bytes(ForkingPickler.dumps((fn, args, kwargs))))
         succeeded, result = ForkingPickler.loads(sent)
         if succeeded:
             future.set_result(result)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from gripper_force.config import config_from_text
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import load_clip
+from gripper_force.jobs.imports import database
 from gripper_force.jobs.imports.database import (
     find_environments,
     find_sets,
@@ -88,9 +89,10 @@ def test_environment_gives_one_log_per_four_touches(environment: Path, tmp_path:
     assert samples[-1].t_ns == frames[-1].t_ns == round((frames[-1].seq - 164) * 1e9 / 149)
 
 
-def test_last_sets_are_for_test(tmp_path: Path) -> None:
-    folder = write_environment(tmp_path / "db" / "sponge_0_50", touches(4 * 15))
-    assert import_environment(folder, tmp_path / "out", size=16).logs == 15
+def test_last_sets_are_for_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "TOUCHES", 1)
+    folder = write_environment(tmp_path / "db" / "sponge_0_50", touches(15))
+    assert import_environment(folder, tmp_path / "out").logs == 15
     assert len(list((tmp_path / "out" / "train").iterdir())) == 12
     test = sorted(path.stem for path in (tmp_path / "out" / "test").iterdir())
     assert test == ["sponge_0_50-13", "sponge_0_50-14", "sponge_0_50-15"]

@@ -137,16 +137,17 @@ def test_wrong_configuration_raises_before_any_motion(
 @pytest.mark.parametrize(
     ("unit", "kind", "sentence"),
     [
-        ("load_cell", "off", r"load cell has given no valid sample for 2 s in set 1"),
-        ("load_cell", "stuck", r"no valid sample for 2 s in set 1 \(rejected: [0-9]+ stuck\)"),
+        ("load_cell", "off", r"load cell has given no valid sample for 0\.5 s in set 1"),
+        ("load_cell", "stuck", r"no valid sample for 0\.5 s in set 1 \(rejected: [0-9]+ stuck\)"),
         ("load_cell", "wrong", "load cell is saturated in set 1, where it last read -?0.0 N"),
-        ("camera", "off", "camera has given no frame for 2 s in set 1"),
+        ("camera", "off", r"camera has given no frame for 0\.5 s in set 1"),
         ("servo", "wrong", "set 1 ended with a fault: the servo reports hardware error 0x20"),
     ],
 )
 def test_device_failure_ends_recording(
-    unit: str, kind: str, sentence: str, config: Config, tmp_path: Path
+    unit: str, kind: str, sentence: str, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(module, "_SILENT_NS", NS_PER_S // 2)
     broken = load_config(None, [f"faults=[{{unit: {unit}, kind: {kind}, at_s: 0.2}}]"]).faults
     with pytest.raises(DeviceError, match=sentence):
         made(config.with_values(faults=broken), RecordingPlan(1), tmp_path)
