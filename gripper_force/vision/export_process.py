@@ -79,8 +79,7 @@ def _main() -> None:
     threading.Thread(target=_end_with_caller, daemon=True).start()
     try:
         model = read_model(checkpoint)  # first: PyTorch takes seconds to load
-        exporter = import_module("gripper_force.vision.export")  # the caller does not need PyTorch
-        exporter.export(model, path)
+        import_module("gripper_force.vision.export").export(model, path)  # the caller does not need PyTorch
     except GripperError as error:
         sys.exit(f"{type(error).__name__}: {' '.join(str(error).split())}")
 
