@@ -1,5 +1,6 @@
 import shutil
 from importlib.util import find_spec
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,8 @@ def test_config_without_auto_is_unchanged(cache: Path) -> None:
 def test_measurements_are_cached(cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vision = VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto")
     monkeypatch.setattr(selection, "installed", lambda: ["torch"])
+    times_ms = (float(n) for n in count(1))
+    monkeypatch.setattr(selection, "step_times_ms", lambda _: (next(times_ms), next(times_ms)))
     first = candidates(vision, set_threads=True)
     assert {candidate.engine for candidate in first} == {"torch"}
     assert len({candidate.threads for candidate in first}) == len(first)
