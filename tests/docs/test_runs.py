@@ -37,6 +37,8 @@ SIMULATED = {"README.md", "docs/your-own-rig.md"}
 
 ADDED = {
     "setup": "--yes --set servo.port=virtual:rig",
+    "grasp --object tube --target-n 3": "--set camera.rate_hz=20",
+    "grasp --object none": "--set camera.rate_hz=20",
     "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3",
     "calibrate object": "--touches 4 --set sim.detail=coarse",
     "teach": "--touches 4 --set sim.detail=coarse --set vision.checkpoint=small",
@@ -49,7 +51,7 @@ ADDED = {
 """Options that shorten a command. They stand before its own, which win."""
 
 REPLACED = {
-    r'overrides=\["object=sponge"\]': 'overrides=["object=sponge", "sim.detail=coarse", "vision.checkpoint=small"]',
+    r'overrides=\["object=sponge"\]': 'overrides=["object=sponge", "sim.detail=coarse", "camera.rate_hz=20"]',
     r"\bmug\b": "lemon",
     " --pause": "",  # nobody is there to press Enter
     r"\bcontrol\.hold_s=[1-9]\d*": "control.hold_s=0.3",
