@@ -80,4 +80,4 @@ def test_a_silence_of_the_bus_that_the_watchdog_tolerates_is_no_error() -> None:
             times_ns.append(cycles.read().t_ns)
             cycles.write(cycles.state.position_rad, 0.0, cycles.approach_m_s)
     periods_ns = [after - before for before, after in pairwise(times_ns)]
-    assert max(periods_ns) > 15_000_000 > 3 * min(periods_ns) - 1, "the bus was silent once"
+    assert max(periods_ns) > 3 * min(periods_ns), "the bus was silent once"
