@@ -538,7 +538,7 @@ class Recorded:
         self._patch.undo()
 
 
-@settings(max_examples=8)
+@settings(max_examples=6)
 @given(
     calls=st.lists(
         st.one_of(
@@ -841,9 +841,10 @@ def test_a_program_that_forgets_to_close_leaves_no_torque(
 
 
 def test_a_program_that_forgets_to_close_a_rendered_rig_ends_in_silence() -> None:
-    program = "import gripper_force as gf; gripper = gf.open_gripper(overrides=['sim.detail=coarse']); gripper.sleep(0.1)"
+    program = "import sys, gripper_force as gf; gripper = gf.open_gripper(overrides=sys.argv[1:]); gripper.sleep(0.1)"
+    sets = ["sim.detail=coarse", "vision.checkpoint=none", "control.feedback=current"]
     ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", program, *sets], capture_output=True, text=True, timeout=60, check=False
     )
     assert (ended.returncode, ended.stderr) == (0, "")
 

@@ -91,7 +91,7 @@ def run(path: Path, count: int = 40) -> list[Record]:
     return records
 
 
-@settings(max_examples=40)
+@settings(max_examples=60)
 @given(st.lists(RECORDS, max_size=12), st.sampled_from([{}, {UTC_NAME: "1790000000123456789"}]))
 def test_every_record_returns_to_the_bit_and_in_the_order_written(
     tmp_path_factory: pytest.TempPathFactory, records: list[Record], metadata: dict[str, str]

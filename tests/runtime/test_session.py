@@ -743,7 +743,7 @@ main()
 
 
 def test_a_full_disk_does_not_end_the_grasp_and_is_told_after_it(quick: list[str], tmp_path: Path) -> None:
-    sets = [*quick, f"log.directory={tmp_path}", "control.hold_s=0.2"]
+    sets = [*quick, f"log.directory={tmp_path}", "control.hold_s=0.2", "log.report=false"]
     arguments = [part for assignment in sets for part in ("--set", assignment)]
     ended = subprocess.run(
         [sys.executable, "-c", FULL_DISK, "grasp", *arguments], capture_output=True, text=True, timeout=60
