@@ -88,10 +88,9 @@ def test_a_squeeze_of_an_example_ends_at_its_force(path: Path, world: Callable[.
 
 @pytest.mark.parametrize("path", RIGS, ids=lambda path: path.stem)
 def test_an_example_rig_shows_the_object(path: Path) -> None:
+    cheap = ["seed=3", "sim.detail=coarse", "camera.rate_hz=30"]
     empty, full = (
-        frame(
-            load_config(path, [f"object={name}", "servo.port=virtual:shown", "seed=3", "sim.detail=coarse"])
-        )
+        frame(load_config(path, [f"object={name}", "servo.port=virtual:shown", *cheap]))
         for name in ("none", OBJECTS[0])
     )
     changed = np.abs(full.astype(int) - empty) > 8
