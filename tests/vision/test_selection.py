@@ -36,6 +36,13 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "gripper-force" / "engines.json"
 
 
+@pytest.fixture
+def _stated_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other times for each engine without a measurement: PyTorch's threads wait for each other on a busy machine."""
+    times_ms = (float(n) for n in count(1))
+    monkeypatch.setattr(selection, "step_times_ms", lambda _: (next(times_ms), next(times_ms)))
+
+
 @pytest.mark.parametrize(
     ("latency_ms", "error_n", "chosen"),
     [
@@ -85,11 +92,10 @@ def test_config_without_auto_is_unchanged(cache: Path) -> None:
     assert not cache.exists()
 
 
+@pytest.mark.usefixtures("_stated_times")
 def test_measurements_are_cached(cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vision = VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto")
     monkeypatch.setattr(selection, "installed", lambda: ["torch"])
-    times_ms = (float(n) for n in count(1))
-    monkeypatch.setattr(selection, "step_times_ms", lambda _: (next(times_ms), next(times_ms)))
     first = candidates(vision, set_threads=True)
     assert {candidate.engine for candidate in first} == {"torch"}
     assert len({candidate.threads for candidate in first}) == len(first)
@@ -106,6 +112,7 @@ def test_measurements_are_cached(cache: Path, tiny_checkpoint: Path, monkeypatch
     assert str(choice).startswith("chose ")
 
 
+@pytest.mark.usefixtures("_stated_times")
 @pytest.mark.parametrize("set_threads", [False, True])
 def test_torch_threads_are_the_programs_own(
     tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch, set_threads: bool
@@ -120,7 +127,6 @@ def test_torch_threads_are_the_programs_own(
         return engine
 
     monkeypatch.setattr(selection, "open_engine", open_and_note)
-    monkeypatch.setattr(selection, "step_times_ms", lambda _: (1.0, 2.0))
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(3)
@@ -150,6 +156,7 @@ def test_engine_of_another_package_is_measured_and_not_cached(
     assert not cache.exists()
 
 
+@pytest.mark.usefixtures("_stated_times")
 @pytest.mark.parametrize("text", ["", "[]", '{"a": {"b": 1}}'])
 def test_damaged_cache_is_measured_again(
     cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch, text: str
