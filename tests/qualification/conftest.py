@@ -1,17 +1,27 @@
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing.reduction import ForkingPickler
+from typing import Any
 
 import pytest
 
+from gripper_force.jobs.processes import answer
+
+
+class PicklingPool(ThreadPoolExecutor):
+    """Threads that run jobs as `process_pool` does: pickled. A process takes seconds to start."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return super().submit(_run, bytes(ForkingPickler.dumps((fn, args, kwargs))))
+
+
+def _run(call: bytes) -> Any:
+    succeeded, result = ForkingPickler.loads(answer(call))
+    if not succeeded:
+        raise result
+    return result
+
 
 @pytest.fixture(scope="session")
-def thread_pool() -> Callable[[int], AbstractContextManager[Executor]]:
-    """Takes the place of `process_pool`: a process takes seconds to start, and does not see what a test replaced."""
-
-    @contextmanager
-    def pool(count: int) -> Iterator[Executor]:
-        with ThreadPoolExecutor(count) as threads:
-            yield threads
-
-    return pool
+def thread_pool() -> type[PicklingPool]:
+    """Takes the place of `process_pool`."""
+    return PicklingPool

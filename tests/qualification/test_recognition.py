@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,8 @@ from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
 
 ROWS = (
-    recognition.Row("known kinds", "still"),
-    recognition.Row("disturbances", "blob", change=recognition.blob),
+    recognition.Row("known kinds", "still", ("stapler",)),
+    recognition.Row("disturbances", "blob", ("stapler",), change=recognition.blob),
 )
 
 
@@ -63,7 +64,7 @@ def test_a_covered_view_is_rejected_and_an_existing_press_is_used_again(
 
 
 def test_rows_with_the_same_scene_make_its_log_once_with_several_workers(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, thread_pool: object
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     running: set[tuple[object, ...]] = set()
     made: set[tuple[object, ...]] = set()
@@ -76,7 +77,7 @@ def test_rows_with_the_same_scene_make_its_log_once_with_several_workers(
         made.add(log)
         return {"force_n": [1.0], "estimate_n": [1.0], "std_n": [1.0], "rejected": [False]}
 
-    monkeypatch.setattr(recognition, "process_pool", thread_pool)
+    monkeypatch.setattr(recognition, "process_pool", ThreadPoolExecutor)
     monkeypatch.setattr(recognition, "_press", make)
     rows = recognition.measure(load_config(), tmp_path, 2, 8)
     assert [row["name"] for row in rows] == [row.name for row in recognition.ROWS]

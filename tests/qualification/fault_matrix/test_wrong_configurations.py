@@ -1,5 +1,6 @@
 """Rows with wrong configurations, in lockstep and on motor current alone where no camera is needed."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gripper_force.qualification.fault_matrix.wrong_configurations import (
     run_rows,
     run_wrong,
 )
+from gripper_force.schema import Tree
 from gripper_force.types import ServoCommand
 
 STAPLER = 3
@@ -70,7 +72,7 @@ def test_wrong_start_is_refused_or_safe(open_position_rad: float, result: str) -
     assert (found["speed_share"] > 0) == (result == "held")  # after a refusal nothing moves
 
 
-@pytest.mark.parametrize("index", [2, STAPLER])
+@pytest.mark.parametrize("index", [8, STAPLER])  # a soft object, whose loss opens the jaws, and a regrip
 def test_an_object_that_leaves_is_a_slip(index: int) -> None:
     found = outcome(leaving(2.4), index)
     assert found["failure"] == ""
@@ -81,6 +83,13 @@ def test_an_object_that_leaves_is_a_slip(index: int) -> None:
 def test_other_rows_without_camera_are_as_expected() -> None:
     for name in ("torque constant", "load cell", "open width: "):
         assert outcome(row(name))["failure"] == ""
+
+
+def test_a_grasp_in_real_time_is_judged() -> None:
+    tree, keys = draw(FAST, case := row("friction", sim__friction=5.0), STAPLER)
+    found = run_wrong({**tree, "clock": "realtime"}, keys, case.expected)
+    assert (found["result"], found["failure"]) == ("stuck", "")
+    assert 0 < found["speed_share"] < 1.5
 
 
 # A row can fail: each defect is planted, and the row must find it.
@@ -135,32 +144,42 @@ def test_draws_cover_the_range_with_every_object(case: WrongCase) -> None:
         assert min(c.sim.friction or 0 for c in configs) == 0.3
 
 
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("wrong") / "wrong.jsonl"
+def run_without_grasp(tree: Tree, keys: dict[str, Any], expected: Sequence[str]) -> WrongOutcome:
+    return {
+        "seed": 1,
+        "keys": keys,
+        "result": f"stuck in {tree['clock']}",
+        "force_share": 0.5,
+        "speed_share": 0.25,
+        "held_nothing": False,
+        "failure": "",
+    }
 
 
 def test_a_table_runs_in_both_clocks_and_continues(
-    kept: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
 ) -> None:
-    rows = (row("friction", object="stapler", sim__friction=5.0), row("closing", object="none"))
+    monkeypatch.setattr(wrong_configurations, "process_pool", thread_pool)
+    monkeypatch.setattr(wrong_configurations, "run_wrong", run_without_grasp)
+    rows, kept = (row("friction"), row("closing")), tmp_path / "wrong.jsonl"
     names: list[str] = []
 
     def progress(text: str, steps: int = 1) -> None:
         names.append(text)
 
-    stuck, empty = run_rows(FAST, 2, 1, 1, kept, rows=rows, progress=progress)
+    friction, closing = run_rows(FAST, 2, 1, 1, kept, rows=rows, progress=progress)
     assert len(names) == count_grasps(2, 1, rows) == 6
-    assert (stuck["runs"], stuck["ok"], stuck["results"]) == (2, 2, {"stuck": 2})
-    assert (stuck["live_runs"], stuck["live_ok"], stuck["live_results"]) == (1, 1, {"stuck": 1})
-    assert empty["results"] == {"no_object": 2}
-    monkeypatch.setattr(wrong_configurations, "process_pool", thread_pool)
-    lines = kept.read_text().splitlines()
-    kept.write_text("\n".join(lines[:-1]) + "\n")
-    assert next(iter(run_rows(FAST, 2, 1, 1, kept, resume=True, rows=rows))) == stuck
-    assert "| friction: 0.3 to 5 times | held, stuck, timeout | 2 of 2, 1 of 1 | stuck 2 | stuck 1 |" in (
-        markdown([stuck, empty])
-    )
+    for summary in (friction, closing):
+        assert (summary["runs"], summary["ok"], summary["results"]) == (2, 2, {"stuck in lockstep": 2})
+        assert (summary["live_runs"], summary["live_ok"]) == (1, 1)
+        assert summary["live_results"] == {"stuck in realtime": 1}
+    cells = "held, stuck, timeout | 2 of 2, 1 of 1 | stuck in lockstep 2 | stuck in realtime 1 |"
+    assert f"| friction: 0.3 to 5 times | {cells}" in markdown([friction, closing])
+    *lines, _ = before = kept.read_text().splitlines()
+    kept.write_text("\n".join(lines).replace("0.5", "0.75") + "\n")
+    again = run_rows(FAST, 2, 1, 1, kept, resume=True, rows=rows)
+    assert [(one["force_share"], one["live_force_share"]) for one in again] == [(0.75, 0.75), (0.75, 0.5)]
+    assert len(kept.read_text().splitlines()) == len(before)
 
 
 def test_the_command_reports_a_row_that_fails(
