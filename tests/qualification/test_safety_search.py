@@ -34,10 +34,10 @@ def results(config: Config, first: int, last: int) -> list[safety_search.CaseRes
 
 
 def test_the_first_cases_hold_all_three_statements(config: Config) -> None:
-    found = results(config, 0, 40)
+    found = results(config, 0, 12)
     assert all(result.ok for result in found)
     assert {"held", "refused", "no_object", "stuck"} <= {result.outcome for result in found}
-    assert found[:5] == results(config, 0, 5)
+    assert found[:2] == results(config, 0, 2)
 
 
 def test_a_lost_object_of_a_small_force_does_not_stay_held(config: Config) -> None:
@@ -62,8 +62,8 @@ def test_draws_cover_what_can_be_wrong(config: Config) -> None:
 
 
 def test_a_sequence_of_requests_can_be_searched(config: Config) -> None:
-    cases = [i for i in range(60) if draw(config.control, RACK, 0, i).requests]
-    assert len(cases) == 15
+    cases = [i for i in range(32) if draw(config.control, RACK, 0, i).requests]
+    assert len(cases) == 8
     found = [run_case(config, 0, i) for i in cases]
     assert all(result.ok for result in found)
     assert any(result.force_share > 0.3 for result in found)
@@ -166,11 +166,11 @@ def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPa
 def test_search_continues_where_it_was_interrupted(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
 ) -> None:
+    monkeypatch.setattr(safety_search, "process_pool", thread_pool)
     keep = tmp_path / "search.jsonl"
     whole = search(config, 6, 1, keep)
     lines = keep.read_text().splitlines(keepends=True)
     keep.write_text("".join(lines[:4]) + lines[4][:20])  # the last line is cut
-    monkeypatch.setattr(safety_search, "process_pool", thread_pool)  # `whole` is from a process
     counts: list[int] = []
 
     def progress(text: str, steps: int = 1) -> None:
@@ -194,9 +194,10 @@ def test_search_continues_where_it_was_interrupted(
 def test_no_linkage_exceeds_the_force_limit(name: str) -> None:
     # The speed depends on the travel per radian, which a wrong start makes wrong for linkages (docs/reliability.md).
     config = load_config(GRIPPERS / f"{name}.yaml")
-    found = results(config, 0, 10)
+    # Cases 89 and 101 press hard: with twice the goal current they exceed the limit by a third with each linkage.
+    found = [run_case(config, config.seed, index) for index in (1, 3, 89, 101)]
     assert not any(result.force_share > 1.05 or result.held_nothing for result in found)
-    assert any(result.force_share > 0.1 for result in found)
+    assert min(result.force_share for result in found[2:]) > 0.6
 
 
 def test_long_fingers_open_at_the_speed_of_a_release() -> None:
