@@ -5,18 +5,22 @@ from typer.testing import CliRunner
 
 from gripper_force import cli
 from gripper_force.qualification.bench import bus_bench as bus
-from gripper_force.qualification.bench.bus_bench import bus_cost
+from gripper_force.qualification.bench.bus_bench import BusCost, bus_cost
 
 
 def test_bench_bus_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus, "BUS_SETTINGS", ((4_000_000, 1.0),))
+    def cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, ...]:
+        return (BusCost("plain SDK", baud_rate, latency_ms, 1.0, 2.0, 3.0 * cycles, 0.25),)
+
+    monkeypatch.setattr(bus, "bus_cost", cost)
     call = ["bench", "bus", "--cycles", "2"]
     assert "plain SDK" in CliRunner().invoke(cli.app, call).stdout
     done = CliRunner().invoke(cli.app, [*call, "--json"])
     (line,) = done.stdout.splitlines()
     printed = json.loads(line)
     assert done.exit_code == 0
-    assert [cost["client"] for cost in printed["bus"]] == ["driver", "driver, arm", "plain SDK", "bare bytes"]
+    assert [(row["baud_rate"], row["latency_ms"]) for row in printed["bus"]] == list(bus.BUS_SETTINGS)
+    assert {row["p99_ms"] for row in printed["bus"]} == {6.0}
     assert {"load", "cores"} < set(printed)
 
 
@@ -26,7 +30,7 @@ def test_bench_bus_rejects_configuration_keys() -> None:
 
 
 def test_cycle_takes_at_least_the_time_of_its_bytes_on_the_line() -> None:
-    cycles, baud_rate, latency_ms = 4, 57_600, 5.0
+    cycles, baud_rate, latency_ms = 4, 230_400, 2.0
     ours, shared, theirs, bare = bus_cost(baud_rate, latency_ms, cycles)
     assert [c.client for c in (ours, shared, theirs, bare)] == [
         "driver",

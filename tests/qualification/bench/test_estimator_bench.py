@@ -1,7 +1,6 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_force.cli import app
-from gripper_force.errors import DataError
-from gripper_force.jobs import int8_export
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench import estimator_bench as estimator
 from gripper_force.qualification.bench.estimator_bench import (
@@ -23,6 +21,9 @@ from gripper_force.qualification.bench.estimator_bench import (
     ratios,
     write_json,
 )
+from gripper_force.qualification.bench.roofline import Roofline
+from gripper_force.types import Gray
+from gripper_force.vision.export import export
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import read_model
 
@@ -68,11 +69,12 @@ def recordings(seed: int) -> list[Clip]:
 def test_bench_measures_every_variant(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for package in ("openvino", "nncf"):
-        if find_spec(package) is None:
-            pytest.skip(f"{package} is not installed: pip install 'gripper-force[engines]'")
+    pytest.importorskip("openvino", reason="pip install 'gripper-force[engines]'")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(int8_export, "_SAMPLES", 80)
+    monkeypatch.setattr(
+        estimator, "measure", lambda precision, threads: Roofline(precision, threads, 1e9, 1e9)
+    )
+    monkeypatch.setattr(estimator, "_memory_mb", lambda *_: 300.0)
     monkeypatch.setattr(estimator, "_ROUNDS", 4)
     monkeypatch.setattr(estimator, "_STEPS", 2)
     monkeypatch.setattr(estimator, "_variants", lambda: [("torch", "float32", "float32")])
@@ -80,6 +82,13 @@ def test_bench_measures_every_variant(
 
     def scaling(model: Model) -> Sequence[Clip]:
         return recordings(1)
+
+    def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> None:
+        """Exports without quantisation, which takes seconds."""
+        assert [clip.tolist() for clip in frames] == [clip.frames.tolist() for clip in recordings(1)]
+        export(model, path)
+
+    monkeypatch.setattr(estimator, "export_int8", export_int8)
 
     def progress(text: str, steps: int = 1) -> None:
         reports.append(text)
@@ -95,9 +104,19 @@ def test_bench_measures_every_variant(
     assert rows[0].mae_n == rows[1].mae_n == rows[2].mae_n != rows[3].mae_n
     assert all(row.p99_ms >= row.p50_ms > 0 for row in rows)
     assert [row.memory_mb for row in rows[:2]] == [None, None]
-    assert all(row.memory_mb is not None and row.memory_mb > 30 for row in rows[2:])
+    assert [row.memory_mb for row in rows[2:]] == [300.0, 300.0]
+    assert all(row.least_ms is not None and row.least_ms > 0 for row in rows[2:])
     assert any(row.front for row in rows)
     assert reports
+
+
+def test_the_memory_is_that_of_a_process_that_only_computes_estimates() -> None:
+    model = read_model("small")
+    assert 30 < estimator._memory_mb(model, "onnxruntime", "float32", 1) < 1000
+    with pytest.raises(
+        ConfigError, match=r"(?s)onnxruntime fails in a separate process: .*computes in float32"
+    ):
+        estimator._memory_mb(model, "onnxruntime", "bfloat16", 1)
 
 
 def test_ratios_compare_the_fastest_accurate_variant_with_the_window() -> None:

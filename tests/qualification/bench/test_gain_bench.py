@@ -14,7 +14,13 @@ from gripper_force.jobs.object_gain import gain_of
 from gripper_force.profiles.object_profile import find_object, read_object, weights_path
 from gripper_force.qualification.bench.gain_bench import best_gain
 
-SETTINGS = ("vision.checkpoint=small", "sim.detail=coarse", "sim.stiffness=1.5")
+SETTINGS = (
+    "vision.checkpoint=small",
+    "sim.detail=coarse",
+    "sim.stiffness=1.5",
+    "control.settle_s=0.2",
+    "control.hold_s=0.7",
+)
 
 
 @pytest.fixture(scope="module")

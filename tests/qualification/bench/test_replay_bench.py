@@ -1,6 +1,6 @@
 import json
-from collections.abc import Sequence
-from importlib.util import find_spec
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from shutil import copy
 from typing import Any
@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from gripper_force import cli
 from gripper_force.errors import GripperError
+from gripper_force.jobs.ray_pool import ray_pool
 from gripper_force.qualification.bench import replay_bench
 from gripper_force.qualification.bench.replay_bench import ReplayRate
 
@@ -24,25 +25,55 @@ def logs(fused_log: Path, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.filterwarnings("default")  # of Ray
-def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_bench, "COMMANDS", ("replay", "evaluate --set vision.precision=bfloat16"))
-    monkeypatch.setattr(replay_bench, "bfloat16_instructions", lambda: "amx_bf16")
+@contextmanager
+def no_cluster(workers: int) -> Iterator[str]:
+    """Takes the place of a Ray cluster, which takes seconds to start."""
+    yield f"cluster of {workers}"
+
+
+def run_here(arguments: Sequence[str]) -> Any:
+    """Runs a command in this process."""
+    done = CliRunner().invoke(cli.app, list(arguments), catch_exceptions=False)
+    assert done.exit_code == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_commands_run_in_every_way(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: Any
+) -> None:
+    addresses: list[str] = []
+
+    def connect(address: str) -> Any:
+        addresses.append(address)
+        return thread_pool(1)
+
+    monkeypatch.setattr("gripper_force.jobs.ray_pool.ray_pool", connect)
+    monkeypatch.setattr("gripper_force.jobs.processes.process_pool", thread_pool)
+    monkeypatch.setattr(replay_bench, "_ray_cluster", no_cluster)
+    monkeypatch.setattr(replay_bench, "_run", run_here)
+    monkeypatch.setattr(replay_bench, "COMMANDS", ("replay", "evaluate --set vision.threads=1"))
     page = tmp_path / "page.md"
     page.write_text("<!-- rates -->\n<!-- end of rates -->\n")
     call = ["bench", "replay", "--logs", str(logs), "--checkpoint", "small", "--rounds", "1", "--jobs", "2"]
-    done = CliRunner().invoke(cli.app, [*call, "--write", str(page), "--json"])
+    done = CliRunner().invoke(cli.app, [*call, "--write", str(page), "--json"], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["replay"]
-    with_ray = ["Ray, 2 workers"] if find_spec("ray") else []
-    assert [row["where"] for row in rows] == 2 * ["1 process", "2 processes", *with_ray]
+    assert [row["where"] for row in rows] == 2 * ["1 process", "2 processes", "Ray, 2 workers"]
+    assert addresses == 2 * ["cluster of 2"]
     assert all(row["rates"][0] > 0 for row in rows)
     assert {row["command"]: row["mae_n"] is None for row in rows} == {
         "replay": True,
-        "evaluate --set vision.precision=bfloat16": False,
+        "evaluate --set vision.threads=1": False,
     }
     assert "| `replay` | small | 2 processes |" in page.read_text()
     assert "2 logs, one round, " in page.read_text()
+
+
+@pytest.mark.filterwarnings("default")  # of Ray
+def test_a_cluster_has_a_cpu_for_each_worker() -> None:
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'gripper-force[ray]'")
+    with replay_bench._ray_cluster(2) as address, ray_pool(str(address)):
+        assert ray.cluster_resources()["CPU"] == 2
 
 
 def test_the_table_has_the_median_and_the_range_of_the_rounds() -> None:

@@ -13,6 +13,7 @@ from gripper_force.cli import app
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.training import few
 from gripper_force.qualification.bench import teach_bench as job
 from gripper_force.qualification.bench.teach_bench import Cell, bench, foreign_rigs, list_cells, markdown
 
@@ -124,6 +125,7 @@ def recordings(
         (folder / f"{number}.avi").touch()
         (folder / f"{number}.csv").touch()
     monkeypatch.setattr(job, "import_video", import_video)
+    monkeypatch.setattr(few, "GRID", 16)  # the side of the discs: a larger one takes seconds
     return folder
 
 

@@ -1,5 +1,5 @@
 import json
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.errors import ConfigError
 from gripper_force.jobs.dataset import Clip
-from gripper_force.qualification.bench.training_bench import COMPARED, Point, learn, reached
+from gripper_force.qualification.bench import training_bench
+from gripper_force.qualification.bench.training_bench import COMPARED, Load, Point, learn, reached
 from gripper_force.vision.preprocess import Preprocess
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -64,9 +65,17 @@ def test_several_networks_or_a_bad_folder_raise(clips: list[Clip], tmp_path: Pat
         next(learn(lambda _: clips, 1.0, KEYS, tmp_path / "file"))
 
 
-def test_bench_training_prints_and_saves_results(few_logs: Path, tmp_path: Path) -> None:
+def test_bench_training_prints_the_minutes_of_each_recipe(
+    few_logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def learn(load: Load, minutes: float, keys: list[str], out: Path, progress: object) -> Iterator[Point]:
+        assert [clip.frames.shape[1:] for clip in load(Preprocess(size=16))] == [(16, 16)] * 3
+        assert (minutes, keys, out) == (0.5, KEYS, tmp_path)
+        yield Point("short clips", 0.25, 10, 0.4, 0.5)
+        yield Point("paper", 0.5, 20, 0.4, 0.5)
+
+    monkeypatch.setattr(training_bench, "learn", learn)
     sets = [part for key in KEYS for part in ("--set", key)]
-    call = ["bench", "training", str(few_logs), "--minutes", "0.01", "--jobs", "1", *sets]
-    shown = CliRunner().invoke(cli.app, [*call, "--out", str(tmp_path / "kept")])
+    call = ["bench", "training", str(few_logs), "--minutes", "0.5", "--jobs", "1", "--out", str(tmp_path)]
+    shown = CliRunner().invoke(cli.app, [*call, *sets], catch_exceptions=False)
     assert "as good as the paper's" in shown.stdout
-    assert "learning.png" in {path.name for path in (tmp_path / "kept").iterdir()}
