@@ -22,7 +22,7 @@ SMALL = Grid(
         "stiffness_n_m": (1e3,),
         "delay_s": (0.035,),
         "gain": (0.9, 1.1),
-        "friction_n": (0.5, 1.0),
+        "friction_n": (1.0,),
         "play_m": (0.0,),
         "step_a": (CURRENT_STEP_A,),
     },

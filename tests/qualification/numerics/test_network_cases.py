@@ -2,7 +2,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from gripper_force.config import Config
 from gripper_force.jobs.dataset import Clip
@@ -24,10 +23,13 @@ from gripper_force.vision.model_files import read_model
 TORCH = ENGINE_VARIANTS[:1]
 OPENVINO = EngineVariant("openvino", "float32", ".xml")
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 @pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
+def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compares less of a grasp than the suite does: first contact, and a little more than one window."""
+    monkeypatch.setattr(suite, "_COMPARED", 26)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +65,7 @@ def test_every_case_is_within_its_bound(
     monkeypatch.setattr(suite, "make_log", lambda *_: fused_log)  # two more grasps take seconds
     monkeypatch.setattr("gripper_force.qualification.numerics.head_fit_cases.cases", lambda: iter(()))
     config = Config.model_validate({"vision": {"checkpoint": str(tiny_checkpoint)}})
-    rows = list(suite.cases(config, None, streamed=150, long=150, variants=TORCH))
+    rows = list(suite.cases(config, None, streamed=40, long=40, variants=TORCH))
     assert broken(rows) == []
     assert len({row.case for row in rows}) == len(rows)
 
@@ -122,7 +124,7 @@ def test_a_drifting_stream_is_found(
     reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pool = suite._inputs(reference, grasp)
-    drift_n, _, _, last = suite._stream(reference, ENGINE_VARIANTS[0], pool, 60)
+    drift_n, _, _, last = suite._stream(reference, ENGINE_VARIANTS[0], pool, 30)
     bound_n = reference.bound_n(last, ROUNDING["float32"]).max()
     assert drift_n <= bound_n
     right = Engine.step
@@ -136,7 +138,7 @@ def test_a_drifting_stream_is_found(
         )
 
     monkeypatch.setattr(Engine, "step", step)
-    assert suite._stream(reference, ENGINE_VARIANTS[0], pool, 60)[0] > bound_n
+    assert suite._stream(reference, ENGINE_VARIANTS[0], pool, 30)[0] > bound_n
 
 
 def test_a_case_is_that_of_the_worst_member() -> None:

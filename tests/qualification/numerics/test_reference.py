@@ -2,17 +2,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from gripper_force.qualification.numerics.reference import ROUNDING, ReferenceEnsemble, Rounding
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.stream_inference import prepared
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 @pytest.fixture
 def reference(tiny_checkpoint: Path, tmp_path: Path) -> ReferenceEnsemble:
-    torch.set_num_threads(1)
     return ReferenceEnsemble(read_model(tiny_checkpoint), tmp_path)
 
 

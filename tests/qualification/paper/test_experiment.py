@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from gripper_force.errors import DataError
+from gripper_force.jobs import dataset
 from gripper_force.jobs.dataset import load_clips
 from gripper_force.jobs.training import train as module
 from gripper_force.jobs.training.train import train
@@ -27,7 +28,7 @@ TINY = Scale(size=32, width=0.25, steps=2, seeds=2)
 
 @pytest.fixture(scope="module", autouse=True)
 def _in_threads(thread_pool: object) -> Iterator[None]:
-    """Trains in this process, except where an end of the time kills a training; test_paper_page has a process."""
+    """Trains in this process, except where an end of the time kills a training."""
     threads, train_all = torch.get_num_threads(), experiment._train_all
 
     def train_here(*arguments: Any) -> None:
@@ -73,13 +74,14 @@ def test_each_network_is_trained_once_with_each_seed(
 
 
 def test_a_gpu_trains_no_more_networks_at_once_than_its_memory_holds(
-    touches: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    touches: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
 ) -> None:
     started: list[int] = []
 
     def train_all(tasks: object, files: object, workers: int, end_s: float, progress: object) -> None:
         started.append(workers)
 
+    monkeypatch.setattr(dataset, "process_pool", thread_pool)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(experiment, "_train_all", train_all)
     for free_gib in (0, 15, 80):

@@ -6,6 +6,7 @@ from typer.testing import CliRunner
 
 from gripper_force import cli
 from gripper_force.errors import ConfigError, GripperError
+from gripper_force.qualification.paper import experiment
 from gripper_force.qualification.paper.paper_page import NAMES, expand_name
 
 
@@ -16,7 +17,10 @@ def test_all_expands_to_everything() -> None:
         expand_name("10")
 
 
-def test_reproduce_makes_a_figure_and_writes_it_into_a_page(touches: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("one_thread")
+def test_reproduce_makes_a_figure_and_writes_it_into_a_page(
+    touches: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread_pool: object
+) -> None:
     page = tmp_path / "paper.md"
     places = ("redrawn small", "redrawn small fig8", "redrawn small 3")
     page.write_text("# Paper\n" + "".join(f"<!-- {p} -->\nold {p}\n<!-- end of {p} -->\n" for p in places))
@@ -39,6 +43,7 @@ def test_reproduce_makes_a_figure_and_writes_it_into_a_page(touches: Path, tmp_p
     assert json.loads(early.stdout)["figures"] == {}
     assert "fig8.png" not in page.read_text()
     assert "not measured" in page.read_text()
+    monkeypatch.setattr(experiment, "process_pool", thread_pool)
     done = CliRunner().invoke(cli.app, ["reproduce", "fig8", "--json", *options])
     assert done.exit_code == 0, done.stderr
     assert "training: 3 of 3, ssam-1, seed 0, 2 steps; 0.0 h left" in done.stderr
