@@ -1,5 +1,5 @@
-"""Servo contract, run on every layout of the registers in memory, on old firmware, on a model of one's own, behind a
-pty, on a port shared with another program, on the simulated rig's servo, and on two servos as one."""
+"""Servo contract, run on every model in memory, on old firmware, on a model of one's own, behind a pty, on a port
+shared with another program, on the simulated rig's servo, and on two servos as one."""
 
 import threading
 import time
@@ -119,16 +119,13 @@ def in_the_rig(stack: ExitStack, quick: list[str]) -> ServoSetup:
     )
 
 
-LAYOUTS = ("XM430-W350", "XL330-M288", "XM335-T323")
-"""Models with two windows of indirect addresses, with a short one, and with a long one at another address."""
-
 OLD_FIRMWARE = {"firmware 44": ("XM430-W350", 44), "firmware 45": ("XL330-M288", 45)}
 """The last firmware without Fast Sync Read; that of the XL330 also has its indirect data at another address."""
 
 
 @pytest.fixture(
     params=[
-        *LAYOUTS,
+        *model_names(),
         *OLD_FIRMWARE,
         "model of one's own",
         "pty",
@@ -196,25 +193,6 @@ class TestDynamixelServo(ServoContract):
             return value == 1
 
         return is_on
-
-
-def test_layouts_are_those_of_all_models() -> None:
-    assert {load_model(name).indirect_windows(52) for name in model_names()} == {
-        load_model(name).indirect_windows(52) for name in LAYOUTS
-    }
-
-
-@pytest.mark.parametrize("name", sorted(set(model_names()) - set(LAYOUTS)))
-def test_numbers_of_every_other_model_keep_the_contract(name: str) -> None:
-    contract = TestDynamixelServo()
-    with ExitStack() as stack:
-        one = in_memory(stack, name)
-        stack.callback(one.servo.close)
-        spec = DynamixelServo.spec(one.config)
-        contract.test_times_increase_and_values_are_plausible(one.servo, spec, one.now_ns, one.wait)
-        one.servo.stop(hold=False)
-        one.servo.close()
-        contract.test_velocity_and_current_belong_to_the_motion(one.servo, one.config, one.wait, 0.2, 0.4)
 
 
 # Tests that need the virtual bus.
