@@ -42,7 +42,6 @@ from gripper_force.types import (
 PAPER_OBJECTS: Final = ("sponge", "paper_cup", "tube", "stapler")
 """Simulated objects like the four of the dataset of Shin et al. 2019."""
 
-_NO_VISION: Final = "the configuration has no network or no camera"
 _CHOICE_EVENT: Final = "took "
 """Start of the event in which logs of version 0.1 name the network that ``auto`` chose."""
 
@@ -229,7 +228,8 @@ def summarise_grasp(path: Path) -> GraspSummary:
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
     shown = vision if expects_vision else None
     if shown is not None and not config.uses_vision:
-        shown = HoldVision(0.0, [VisionLoss(_NO_VISION, sum(loss.time_s for loss in shown.losses))])
+        why = "the configuration has no network or no camera"
+        shown = HoldVision(0.0, [VisionLoss(why, sum(loss.time_s for loss in shown.losses))])
     # A release that fails does not change what the grasp reached.
     outcomes = [s.outcome for s in statuses if s.outcome not in (Outcome.NONE, Outcome.BLOCKED)]
     result = outcomes[-1] if outcomes else "interrupted"

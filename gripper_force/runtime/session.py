@@ -316,13 +316,13 @@ class Session:
             if self._armed:
                 self._devices.servo.stop(hold=self._end_action == "hold")
         except DeviceError as second:
-            first = self._error
+            first, self._error = self._error, second
             if not isinstance(first, GripperError):
                 raise
             raise type(first)(f"{first}; and the servo could not be stopped: {second}") from first
         finally:
             self._perception.close()
-        self._log_sensors(self._devices.clock.now_ns(), at_end=True)
+            self._log_sensors(self._devices.clock.now_ns(), at_end=True)
 
     def log_event(self, unit: str, text: str) -> None:
         """Logs one sentence about a unit, such as ``control``."""

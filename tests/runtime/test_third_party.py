@@ -238,21 +238,24 @@ def test_settings_that_fail_do_not_cost_the_log(config: Config, tmp_path: Path) 
     assert LogReader(tmp_path / "run.mcap").complete
 
 
-def test_a_camera_that_fails_at_the_end_does_not_hide_a_servo_that_does_not_stop(
-    config: Config, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("fails", ["settings", ""])
+def test_a_camera_at_the_end_does_not_hide_a_servo_that_does_not_stop(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str
 ) -> None:
     def stop(*, hold: bool) -> None:
         raise DeviceError("the servo does not answer")
 
-    settings = resolve(with_own(config, "camera", "settings"))
+    path = tmp_path / "run.mcap"
+    settings = resolve(with_own(config, "camera", fails))
     with open_devices(settings.config) as devices:
         with (
             pytest.raises(DeviceError, match=r"^the servo does not answer"),
-            open_session(settings, devices, None) as session,
+            open_session(settings, devices, path) as session,
         ):
             session.cycle()
             monkeypatch.setattr(devices.servo, "stop", stop)
         monkeypatch.undo()
+    assert ("camera.json" in LogReader(path).attachments) == (not fails)
 
 
 def test_a_servo_that_fails_is_told_to_stop(config: Config, tmp_path: Path) -> None:
