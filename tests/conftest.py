@@ -3,10 +3,13 @@
 import gc
 import signal
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from hypothesis import settings
 
 from gripper_force.config import dump_config, load_config
 from gripper_force.interfaces import Clock
+from gripper_force.jobs import processes
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.profiles.rig_profile import CalibratedValue, ServoCalibration
@@ -274,6 +278,32 @@ def _write_log(clip: Clip, folder: Path) -> Path:
             log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))
             log.write(LoadCellSample(i * 20 * NS_PER_MS, force_n, force_n, True))
     return path
+
+
+class PicklingPool(ThreadPoolExecutor):
+    """Threads that run jobs as `process_pool` does: pickled. A process takes seconds to start."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return super().submit(_run, bytes(ForkingPickler.dumps((fn, args, kwargs))))
+
+
+def _run(call: bytes) -> Any:
+    succeeded, result = ForkingPickler.loads(processes.answer(call))
+    if not succeeded:
+        raise result
+    return result
+
+
+@pytest.fixture(scope="session")
+def thread_pool() -> type[PicklingPool]:
+    """Takes the place of `process_pool`."""
+    return PicklingPool
+
+
+@pytest.fixture
+def pool_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replaces the processes of jobs; `test_processes` has those."""
+    monkeypatch.setattr(processes, "process_pool", PicklingPool)
 
 
 @pytest.fixture
