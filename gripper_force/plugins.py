@@ -13,16 +13,14 @@ from typing import Any, Final
 from gripper_force.errors import ConfigError, DeviceError, GripperError
 
 _METHODS: Final = {
-    "servos": ("spec", "start", "read", "write", "stop", "close"),
-    "cameras": ("newest", "start", "counts", "close"),
-    "load_cells": ("drain", "start", "counts", "close"),
-    "engines": ("step", "warm_up"),
+    "servos": dict.fromkeys(("spec", "start", "write", "stop", "close"), "object") | {"read": "ServoState"},
+    "cameras": {"newest": "Frame NoneType", "start": "object", "counts": "dict", "close": "object"},
+    "load_cells": {"drain": "list tuple", "start": "object", "counts": "dict", "close": "object"},
+    "engines": {"step": "StepOutput", "warm_up": "object", "reset": "object"},
 }
-"""Methods of each interface, which a class, or what a function makes, is checked for before one is called."""
-
-_RETURNS: Final = {"read": "ServoState", "newest": "Frame NoneType", "drain": "list tuple", "counts": "dict"}
-"""Names of the types that methods may return; names, because importing the types takes time. A wrong type is reported
-here, where the class is known."""
+"""Methods of each interface, which a class, or what a function makes, is checked for before one is called, and names of
+the types that they may return; names, because importing the types takes time. A wrong type is reported here, where the
+class is known."""
 
 EXTRAS: Final = {
     **dict.fromkeys(("torch", "onnx", "onnxscript"), "train"),
@@ -106,11 +104,13 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
 
 def _check_methods(part: Any, group: str, name: str) -> None:
     if missing := [method for method in _METHODS.get(group, ()) if not hasattr(part, method)]:
-        interface = "vision.engines.Engine" if group == "engines" else "interfaces"
         raise ConfigError(
-            f"{name} has no method {missing[0]!r}; name a class with the methods that gripper_force.{interface} "
-            "describes"
+            f"{name} has no method {missing[0]!r}; name a class with the methods that {_interface(group)} describes"
         )
+
+
+def _interface(group: str) -> str:
+    return f"gripper_force.{'vision.engines.Engine' if group == 'engines' else 'interfaces'}"
 
 
 class _Plugin:
@@ -141,10 +141,10 @@ class _Plugin:
                 f"{called}() raised {type(error).__name__}: {' '.join(str(error).split())}; it is no part of "
                 "gripper-force: correct it, or tell its author"
             ) from error
-        expected = _RETURNS.get(called.rpartition(".")[2], "object").split()
+        expected = _METHODS.get(self._group, {}).get(called.rpartition(".")[2], "object").split()
         if not any(base.__name__ in expected for base in type(result).__mro__):
             found = f"{called}() returned {type(result).__name__}"
-            raise self._error_type(f"{found}; return what gripper_force.interfaces says")
+            raise self._error_type(f"{found}; return what {_interface(self._group)} says")
         return result
 
 

@@ -283,8 +283,7 @@ def test_a_servo_whose_start_returns_nothing_is_told_to_stop(
 
 def test_an_engine_and_a_module_that_fail_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "own_engine.py").write_text(
-        "class Engine:\n    def __init__(self, *_): 1 / 0\n    def step(self, frame): ...\n"
-        "    def warm_up(self): ...\n"
+        "class Engine:\n    def __init__(self, *_): 1 / 0\n    step = warm_up = reset = print\n"
     )
     (tmp_path / "own_module.py").write_text("1 / 0")
     monkeypatch.syspath_prepend(tmp_path)
@@ -293,3 +292,47 @@ def test_an_engine_and_a_module_that_fail_are_named(tmp_path: Path, monkeypatch:
         engine(None, "float32", 1)
     with pytest.raises(ConfigError, match=r"can't import 'own_module': division by zero; "):
         load_class("engines", {}, "own_module:Engine", "vision.engine")
+
+
+EYES = """
+import numpy as np
+
+from gripper_force.vision.engines import Engine, StepOutput
+
+class Eyes(Engine):
+    def __init__(self, model, precision, threads):
+        super().__init__(model.header)
+
+    def _zero_states(self): ...
+
+    def _infer(self, frame):
+        members = self.header.members
+        forces_n = np.zeros(len(members), np.float32)
+        features = np.zeros(sum(member.head for member in members), np.float32)
+        return {result}
+"""
+NO_ARRAYS = rf"Eyes\.warm_up\(\) raised TypeError: forces_n and features must be NumPy arrays of 1 dimension, .*{REMEDY}"
+
+
+@pytest.mark.parametrize(
+    ("result", "sentence"),
+    [
+        (
+            "forces_n",
+            r"Eyes\.step\(\) returned ndarray; return what gripper_force\.vision\.engines\.Engine says$",
+        ),
+        ("StepOutput(forces_n.tolist(), features, None)", NO_ARRAYS),
+        ("StepOutput(forces_n, features[None], None)", NO_ARRAYS),
+        ("StepOutput(forces_n, features, features)", NO_ARRAYS),
+    ],
+)
+def test_an_engine_that_returns_something_else_is_named(
+    quick_vision: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: str, sentence: str
+) -> None:
+    (tmp_path / "own_eyes.py").write_text(EYES.replace("{result}", result))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_eyes", raising=False)
+    config = load_config(None, [*quick_vision, "vision.engine=own_eyes:Eyes", "log.report=false"])
+    with pytest.raises(ConfigError, match=rf"^vision\.engine=own_eyes:Eyes: .*{sentence}"):
+        run_grasp(config, tmp_path / "run.mcap")
+    assert virtual.find_bus("rig") is None

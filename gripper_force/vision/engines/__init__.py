@@ -39,6 +39,14 @@ class StepOutput:
     features: Floats
     attention: Floats | None
 
+    def __post_init__(self) -> None:
+        """Raises `TypeError` if a field, perhaps of an engine of another package, is no array with its dimensions."""
+        vectors = (self.forces_n, self.features, *(() if self.attention is None else self.attention[:1]))
+        if not all(isinstance(vector, np.ndarray) and vector.ndim == 1 for vector in vectors):
+            raise TypeError(
+                "forces_n and features must be NumPy arrays of 1 dimension, attention of 2, or None"
+            )
+
 
 class Engine(ABC):
     """An ensemble that takes one frame after the other. Not thread-safe.
