@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -87,9 +88,8 @@ def engine_version(engine: str) -> str:
     """
     if engine not in ENGINES and (point := registered("engines").get(engine)) is not None:
         return point.dist.version if point.dist is not None else ""
-    package = engine if engine in ENGINES else engine.partition(":")[0].partition(".")[0]
     try:
-        return version(package)
+        return version(engine.partition(":")[0].partition(".")[0])
     except (PackageNotFoundError, ValueError):  # the latter: an empty name
         return ""
 
@@ -104,40 +104,34 @@ def cache_key(model: Model, engine: str, precision: str, threads: int) -> str:
 
 
 def read_cache() -> dict[str, EngineCandidate]:
-    """Returns the measurements of this machine by `cache_key`; none if the file is missing or malformed."""
-    try:
-        return {
-            key: EngineCandidate(**candidate)
-            for key, candidate in json.loads(_cache_file().read_text(encoding="utf-8")).items()
-        }
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}
+    """Returns the measurements of this machine by `cache_key`; a malformed line of the file is left out."""
+    known = {}
+    with suppress(OSError, ValueError):
+        for line in _cache_file().read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError, TypeError):
+                key, candidate = json.loads(line)
+                known[key] = EngineCandidate(**candidate)
+    return known
 
 
 def update_cache(measured: dict[str, EngineCandidate]) -> None:
-    """Adds measurements to the cache. Does nothing if its folder is not writable."""
-    path = _cache_file()
-    entries = {key: asdict(candidate) for key, candidate in (read_cache() | measured).items()}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(f".{os.getpid()}")
-        partial.write_text(json.dumps(entries, indent=1), encoding="utf-8")
-        partial.replace(path)
-    except OSError:
-        return
+    """Adds measurements to the cache, one line each, so that no process replaces another's; nothing if it can't."""
+    # An interruption may have cut the last line.
+    lines = ["\n" + json.dumps([key, asdict(candidate)]) for key, candidate in measured.items()]
+    with suppress(OSError):
+        _cache_file().parent.mkdir(parents=True, exist_ok=True)
+        with _cache_file().open("a", encoding="utf-8") as file:
+            file.write("".join(lines))
 
 
 def _cache_file() -> Path:
-    return cache_folder() / "engines.json"
+    return cache_folder() / "engines.jsonl"
 
 
 @cache
 def _machine() -> str:
-    cpu = next(
-        (line.split(":", 1)[1].strip() for line in cpu_info() if line.startswith("model name")),
-        platform.processor(),
-    )
-    return f"{platform.node()} {cpu} {os.cpu_count()}"
+    names = (line.partition(":")[2].strip() for line in cpu_info() if line.startswith("model name"))
+    return f"{platform.node()} {next(names, platform.processor())} {os.cpu_count()}"
 
 
 def cpu_info() -> list[str]:

@@ -33,7 +33,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(step_benchmark, "_WARM_UP_STEPS", 1)
     resolve_auto.cache_clear()
     engine_version.cache_clear()
-    return tmp_path / "gripper-force" / "engines.json"
+    return tmp_path / "gripper-force" / "engines.jsonl"
 
 
 @pytest.fixture

@@ -1,7 +1,8 @@
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,7 @@ from gripper_force.vision.step_benchmark import (
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     engine_version.cache_clear()
-    yield tmp_path / "gripper-force" / "engines.json"
+    yield tmp_path / "gripper-force" / "engines.jsonl"
     engine_version.cache_clear()
 
 
@@ -60,7 +61,31 @@ def test_cache_keeps_earlier_measurements(cache: Path) -> None:
     update_cache({"a": slow})
     update_cache({"b": fast})
     assert read_cache() == {"a": slow, "b": fast}
-    assert [path.name for path in cache.parent.iterdir()] == ["engines.json"]
+    assert [path.name for path in cache.parent.iterdir()] == ["engines.jsonl"]
+
+
+def test_a_measurement_that_another_process_adds_meanwhile_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one = EngineCandidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
+
+    def late(candidate: EngineCandidate) -> dict[str, Any]:
+        monkeypatch.setattr(step_benchmark, "asdict", asdict)
+        update_cache({"other": one})
+        return asdict(candidate)
+
+    monkeypatch.setattr(step_benchmark, "asdict", late)
+    update_cache({"one": one})
+    assert read_cache() == {"one": one, "other": one}
+
+
+def test_a_line_that_an_interruption_has_cut_costs_no_other(cache: Path) -> None:
+    one = EngineCandidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
+    update_cache({"one": one})
+    cache.write_text(f"null\n[1, {{}}]{cache.read_text()}{cache.read_text()[:40]}")
+    assert read_cache() == {"one": one}
+    update_cache({"other": one})
+    assert read_cache() == {"one": one, "other": one}
 
 
 def test_unwritable_cache_is_ignored(cache: Path) -> None:
