@@ -15,16 +15,21 @@ _TRIES: Final = 10
 
 
 @contextmanager
-def unfinished(path: Path) -> Iterator[Path]:
+def unfinished(path: Path, *, wait: bool = False) -> Iterator[Path]:
     """Gives a file to write beside ``path``, which gets that name at the end; after an error it stays where it is.
 
     One that an interrupted run left is removed first.
+
+    Args:
+        path: The file.
+        wait: True to wait for another writer, for a file that takes no time to write. What is read of the old file in
+            the block is then complete.
 
     Raises:
         DataError: Another process or thread writes the file.
     """
     part = path.with_name(f".{path.name}.part")
-    with _only_writer(path):
+    with _only_writer(path, wait):
         part.unlink(missing_ok=True)
         yield part
         part.replace(path)
@@ -38,12 +43,12 @@ def make_place(path: Path) -> None:
 
 
 @contextmanager
-def _only_writer(path: Path) -> Iterator[None]:
+def _only_writer(path: Path, wait: bool) -> Iterator[None]:
     """Locks a file for this writer; without it, two would write and rename the same unfinished file."""
     lock = path.with_name(f".{path.name}.lock")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = _locked(lock)
+        file = _locked(lock, wait)
     except OSError:  # the writer meets it too, and says what it could not write
         yield
         return
@@ -58,13 +63,13 @@ def _only_writer(path: Path) -> Iterator[None]:
         os.close(file)
 
 
-def _locked(lock: Path) -> int | None:
+def _locked(lock: Path, wait: bool) -> int | None:
     """Makes, opens and locks a file. Returns its descriptor; None if another writer holds the lock."""
     for _ in range(_TRIES):
         file = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         is_free = True
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             is_free = False
         except OSError:  # not every file system has locks

@@ -1,6 +1,7 @@
 """Writing of profiles."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -80,12 +81,12 @@ def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | Cam
 
     Raises:
         ConfigError: The file exists and is not a rig profile, or it can't be written.
-        DataError: Another process or thread writes it.
     """
-    profile = rig_to_update(path)
     names = {LoadCellCalibration: "load_cell", ServoCalibration: "servo", CameraCalibration: "camera"}
-    profile = profile.model_copy(update={names[type(section)]: section})
-    write_all({path: dump(profile).encode()})
+    rig_to_update(path)  # raises
+    with _naming(path), unfinished(path, wait=True) as part:  # a second calibration may write another section
+        profile = rig_to_update(path).model_copy(update={names[type(section)]: section})
+        part.write_bytes(dump(profile).encode())
     return profile
 
 
@@ -96,11 +97,17 @@ def write_all(files: dict[Path, bytes]) -> None:
         ConfigError: One can't be written.
         DataError: Another process or thread writes one of them.
     """
+    with _naming(*files), ExitStack() as stack:
+        for path, data in reversed(files.items()):  # the stack renames the last one first
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(unfinished(path)).write_bytes(data)
+
+
+@contextmanager
+def _naming(*files: Path) -> Iterator[None]:
+    """Raises `ConfigError` that names the files for an `OSError` of writing them."""
     try:
-        with ExitStack() as stack:
-            for path, data in reversed(files.items()):  # the stack renames the last one first
-                path.parent.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(unfinished(path)).write_bytes(data)
+        yield
     except OSError as error:
         names = " and ".join(map(str, files))
         where = "" if error.filename is None else f", {error.filename}"  # a full disk names no file

@@ -1,11 +1,13 @@
 from datetime import UTC, datetime
 from pathlib import Path
+from threading import Thread
 
 import pytest
 import yaml
 
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
+from gripper_force.jobs import profile_files
 from gripper_force.jobs.profile_files import update_rig
 from gripper_force.profiles.rig_profile import (
     CalibratedValue,
@@ -14,6 +16,7 @@ from gripper_force.profiles.rig_profile import (
     ServoCalibration,
     read_rig,
 )
+from gripper_force.schema import dump
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 CELL = LoadCellCalibration(
@@ -75,6 +78,25 @@ def test_invalid_file_is_refused_and_kept(tmp_path: Path, text: str, sentence: s
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
     assert path.read_text() == text
+
+
+def test_a_section_that_another_calibration_writes_meanwhile_is_kept(
+    servo_calibration: ServoCalibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.yaml"
+    update_rig(path, CELL.model_copy(update={"sensor": "old"}))
+    other = Thread(target=update_rig, args=(path, servo_calibration))
+
+    def dump_late(profile: RigProfile) -> str:
+        if not other.ident:
+            other.start()
+            other.join(0.5)  # without a lock it writes here, and its section is lost
+        return dump(profile)
+
+    monkeypatch.setattr(profile_files, "dump", dump_late)
+    update_rig(path, CELL)
+    other.join()
+    assert read_rig(path) == RigProfile(load_cell=CELL, servo=servo_calibration)
 
 
 @pytest.mark.parametrize(
