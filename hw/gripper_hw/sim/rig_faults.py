@@ -123,6 +123,9 @@ class FaultyLoadCell:
         self._cell.close()
 
     def _add(self, kind: str, t_ns: int, raw: float) -> None:
+        if t_ns < self._next_ns:  # after a delay, samples older than the last one are lost
+            return
+        self._next_ns = t_ns + (_SLOW_SAMPLE_PERIOD_NS if kind == "slow" else 1)
         match kind:
             case "off":
                 return
@@ -132,10 +135,6 @@ class FaultyLoadCell:
                 raw = float(
                     self._rng.choice([math.nan, math.inf, self._rng.uniform(-_FULL_SCALE_N, _FULL_SCALE_N)])
                 )
-            case "slow":
-                if t_ns < self._next_ns:
-                    return
-                self._next_ns = t_ns + _SLOW_SAMPLE_PERIOD_NS
             case "intermittent" if t_ns // _GAP_NS % 2:
                 return
         self._last_n = raw
