@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from gripper_force import __version__
 from gripper_force.config import Config, LogConfig, VisionConfig, config_from, dump_config
 from gripper_force.errors import DataError
 from gripper_force.files import unfinished
@@ -196,7 +197,7 @@ def measure(
 
     Args:
         config: Configuration; ``vision.checkpoint`` is the network.
-        folder: Folder for logs and estimates; existing ones are used again.
+        folder: Folder for logs and estimates; existing ones of this version are used again.
         presses: Presses of each row.
         workers: Number of processes.
         progress: Called once for each press of each row.
@@ -260,9 +261,10 @@ def _press(row: int, index: int, folder: Path, tree: Tree) -> Tree:
     scene = "-".join(name for name, _ in spec.settings) or "still"
     log = plan("press", index + 1, FIRST_SEED, spec.objects)[index]
     pressed = config.with_values(sim=dict(spec.settings))
-    # The key of a press holds no network and no folder.
+    # The key of a press holds this version, because another one may simulate or judge it otherwise, but no network and
+    # no folder.
     made = dump_config(pressed.with_values(vision=VisionConfig(region=config.vision.region), log=LogConfig()))
-    key = hashlib.sha256(made.encode()).hexdigest()[:12]
+    key = hashlib.sha256(f"{__version__} {made}".encode()).hexdigest()[:12]
     logs = folder / "logs" / f"{scene}-{key}"
     logs.mkdir(parents=True, exist_ok=True)
     path = logs / log.name

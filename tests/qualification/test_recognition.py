@@ -56,6 +56,11 @@ def test_a_covered_view_is_rejected_and_an_existing_press_is_used_again(
     CliRunner().invoke(cli.app, [*command, "--set", "vision.max_covered=0.5"], catch_exceptions=False)
     assert len(list(tmp_path.rglob("disturbances-*.json"))) == 2  # what another check has judged is not used
 
+    with monkeypatch.context() as patch:
+        patch.setattr(recognition, "__version__", "0.1.0")
+        simulates = CliRunner().invoke(cli.app, command).exception
+    assert "make_log" in str(simulates)
+
     for kept in tmp_path.rglob("disturbances-*.json"):
         kept.write_text("{")
     error = CliRunner().invoke(cli.app, command).exception

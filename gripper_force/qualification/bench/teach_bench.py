@@ -2,7 +2,7 @@
 
 A *cell* is one rig, one object, one number of touches and one method. Its figures are the error of vision on fresh
 touches up to `TOUCH_PEAK_N`, the median error of grasps, and the minutes that the method took after the touches. A
-finished cell is one line of a file, and is not repeated with the same settings and number of grasps.
+finished cell is one line of a file, and is not repeated with the same version, settings and number of grasps.
 """
 
 import hashlib
@@ -21,6 +21,7 @@ from gripper_calibration.fits.object_fit import fit_correction
 from gripper_calibration.fits.touches import Touches
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
 from gripper_calibration.procedures.teach import teach
+from gripper_force import __version__
 from gripper_force.config import Config, dump_config, load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip, digest, load_clips, without_contact_starts
@@ -94,7 +95,7 @@ class Cell:
         learned: What `teach` took.
         problem: Reason why the method gave nothing; empty if it did.
         grasps: Grasps with each feedback.
-        settings: Digest of the rig's configuration; empty in files of earlier versions, whose cells are measured again.
+        settings: Digest of version and configuration of the rig. Cells of other versions are measured again.
     """
 
     rig: str
@@ -151,7 +152,7 @@ def list_cells(
     cells = []
     for rig in rigs:
         network = read_model(rig.config.vision.checkpoint).digest
-        settings = _digest(dump_config(rig.config))
+        settings = _digest(f"{__version__} {dump_config(rig.config)}")
         for name in objects:
             for method in methods:
                 for count in (0,) if method == "shipped" else counts:
@@ -324,7 +325,7 @@ class RecordingRow(NamedTuple):
         untaught_n: MAE of the process that was fitted to the other objects.
         calibrated_n: The same, calibrated on the trials.
         taught_n: MAE of a process fitted to the other objects and the trials.
-        recordings: Digest of all recordings; empty in files of earlier versions, whose rows are not used again.
+        recordings: Digest of version and recordings. Rows of other versions are not used again.
     """
 
     object: str
@@ -383,10 +384,11 @@ def import_missing(recordings: Path, folder: Path, progress: Progress = no_progr
 
     Args:
         recordings: Folder as for `import video`.
-        folder: Folder of the logs, in which each folder of recordings has its own: two may have the same names.
+        folder: Folder of the logs, in which each folder of recordings has its own: two may have the same names. So has
+            each version, which may import otherwise.
         progress: Called before each import.
     """
-    logs = folder / f"recordings-{_digest(str(recordings.resolve()))[:8]}"
+    logs = folder / f"recordings-{_digest(f'{__version__} {recordings.resolve()}')[:8]}"
     paths = []
     for name, video, forces in find_recordings(recordings):
         paths.append(logs / f"{name}.mcap")
@@ -397,8 +399,8 @@ def import_missing(recordings: Path, folder: Path, progress: Progress = no_progr
 
 
 def digest_of_recordings(clips: Sequence[Clip]) -> str:
-    """Returns the digest of all frames, forces and objects."""
-    return _digest(f"{digest(clips)} {[clip.object for clip in clips]}")
+    """Returns the digest of this version and all frames, forces and objects."""
+    return _digest(f"{__version__} {digest(clips)} {[clip.object for clip in clips]}")
 
 
 def _recording_row(

@@ -70,6 +70,9 @@ def test_a_cell_of_other_settings_or_of_an_earlier_version_is_measured_again(
     assert cell(4, "control.force_limit_n=5").settings != first.settings
     assert len(file.read_text().splitlines()) == 4
     assert cell(4) == first
+    monkeypatch.setattr(job, "__version__", "0.1.0")
+    assert cell(4).settings != first.settings
+    assert len(file.read_text().splitlines()) == 5
 
 
 def test_the_time_of_teaching_is_that_of_the_whole_work(
@@ -155,6 +158,15 @@ def test_real_recordings_are_left_out_by_object_and_taught_in_order(recordings: 
     fewer = measured(recordings, tmp_path)
     assert [row["tested"] for row in fewer] == [2, 1, 2, 1, 1]
     assert {row["recordings"] for row in fewer}.isdisjoint({row["recordings"] for row in rows})
+
+
+def test_another_version_imports_the_recordings_again_and_uses_no_row_of_this_one(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs, rows = job.import_missing(recordings, tmp_path), job.digest_of_recordings([])
+    monkeypatch.setattr(job, "__version__", "0.1.0")
+    assert set(logs).isdisjoint(job.import_missing(recordings, tmp_path))
+    assert job.digest_of_recordings([]) != rows
 
 
 def test_recordings_of_which_none_can_be_left_out_do_not_replace_the_table_of_rigs(
