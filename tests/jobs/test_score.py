@@ -112,7 +112,7 @@ def test_share_of_vision_counts_the_hold_of_the_last_grasp():
     used = vision_in_hold(
         states, fused(states, lambda i: i >= 425), [], told((90, dropped("it is 70 ms old")))
     )
-    assert rounded(used) == (0.75, [("it is 70 ms old", 0.25)])
+    assert rounded(used) == (0.75, [("it is 70 ms old at first", 0.25)])
 
 
 def test_losses_are_summed_by_reason_and_the_longest_comes_first():
@@ -125,7 +125,10 @@ def test_losses_are_summed_by_reason_and_the_longest_comes_first():
         (160, dropped("it jumps by 1.10 N")),
     )
     used = vision_in_hold(states, fused(states, lambda i: i not in lost), [], events)
-    losses = [("it differs from the motor current by 1.20 N", 0.3), ("it jumps by 1.10 N", 0.25)]
+    losses = [
+        ("it differs from the motor current by 1.20 N at first", 0.3),
+        ("it jumps by 1.10 N at first", 0.25),
+    ]
     assert rounded(used) == (0.45, losses)
 
 
