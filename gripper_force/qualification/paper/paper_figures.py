@@ -19,8 +19,8 @@ from gripper_force.vision.batch_inference import normalise
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess, downscale
 
-_BINS: Final = 11
-"""Force bins of 1 N each."""
+BINS: Final = 11
+"""Force bins of 1 N each in figure 6, which leaves out larger forces."""
 
 _COLOURS: Final = {BASELINE: "#8a9099", SINGLE_FRAME: "#2a9d8f", PROPOSED: "#d1495b"}
 _LOADS: Final = (0.0, 0.25, 0.6, 1.0)
@@ -33,7 +33,7 @@ _SIDE: Final = 192
 def error_by_force(test: Test) -> Figure:
     """Figure 6: MAE by measured force, in 11 bins of 1 N."""
     level = np.floor(test.measured_n).clip(0).astype(int)
-    filled = [n for n in range(_BINS) if (level == n).any()]
+    filled = [n for n in range(BINS) if (level == n).any()]
     with rc_context(STYLE):
         figure = Figure(figsize=(9, 3.4), layout="constrained")
         axes = figure.subplots()
@@ -54,7 +54,7 @@ def error_by_force(test: Test) -> Figure:
             )
         axes.set_xlabel("measured force, N")
         axes.set_ylabel("MAE, N")
-        axes.set_xticks(range(_BINS + 1))
+        axes.set_xticks(range(BINS + 1))
         axes.set_title("Error by force, mean ± s.d. over seeds")
         axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.2)
     return figure

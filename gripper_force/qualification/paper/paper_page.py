@@ -161,7 +161,7 @@ def markdown(result: PaperResult, scale_name: str, scale: Scale, pictures: str) 
 
 
 _CAPTIONS: Final = {
-    "fig6": f"Figure 6: error by force, of baseline, {SINGLE_FRAME} and {PROPOSED}",
+    "fig6": f"Figure 6: error by force up to {paper_figures.BINS} N, of baseline, {SINGLE_FRAME} and {PROPOSED}",
     "fig7": "Figure 7: estimates over time, one test set of each object",
     "fig8": "Figure 8: spatial attention (SSAM) at rising force; brighter means more attention",
     "fig9": "Figure 9: estimates of baseline and proposed model over time",
