@@ -27,10 +27,10 @@ from gripper_force.qualification.loop_margin.analytic_plant import CYCLE_NS, tra
 from gripper_force.qualification.numerics.numerical_case import NumericalCase
 from gripper_force.types import NS_PER_MS, NS_PER_S, Request, RequestKind, ServoState, VisualForce
 
-CYCLES: Final = 1_000_000
+LONG_CYCLES: Final = 1_000_000
 """Cycles of the longest case: 83 minutes at 200 Hz."""
 
-OTHERS: Final = 4000
+SHORT_CYCLES: Final = 4000
 """Cycles of the other cases."""
 
 _ROUNDING_N: Final = 1e-9
@@ -134,14 +134,14 @@ class _DecimalFusion:
 
 
 def cases(
-    config: Config, _maps: Path | None, cycles: int = CYCLES, others: int = OTHERS
+    config: Config, _maps: Path | None, long_cycles: int = LONG_CYCLES, short_cycles: int = SHORT_CYCLES
 ) -> Iterator[NumericalCase]:
     """Yields the cases of the filter.
 
     Args:
         config: Control and gripper under test.
-        cycles: Cycles of the longest case.
-        others: Cycles of the other cases; those with irregular frames have twice as many.
+        long_cycles: Cycles of the longest case.
+        short_cycles: Cycles of the other cases; those with irregular frames have twice as many.
     """
     control, gripper = config.control, config.gripper
 
@@ -158,42 +158,51 @@ def cases(
         )
 
     rng = np.random.default_rng([config.seed, 40])
-    yield against(f"{cycles} cycles", "4 ± 3 N, frames at 60 Hz", _steady(rng, cycles))
+    yield against(f"{long_cycles} cycles", "4 ± 3 N, frames at 60 Hz", _steady(rng, long_cycles))
     yield NumericalCase(
         "clock near 2^62 ns",
         "146 years of uptime, compared with the same cycles from 0; number of estimates that differ",
-        _count_shifted(control, gripper, 2**62, config.seed, 2 * others),
+        _count_shifted(control, gripper, 2**62, config.seed, 2 * short_cycles),
         0.0,
     )
-    late = (one for day in range(10) for one in _steady(rng, others // 20, begin_ns=NS_PER_S + day * _DAY_NS))
+    late = (
+        one
+        for day in range(10)
+        for one in _steady(rng, short_cycles // 20, begin_ns=NS_PER_S + day * _DAY_NS)
+    )
     yield against("ten days of uptime", "one second of cycles per day", late)
     yield against(
-        "repeated timestamps", "every cycle and every frame four times", _repeated(rng, others // 2)
+        "repeated timestamps", "every cycle and every frame four times", _repeated(rng, short_cycles // 2)
     )
-    yield against("clock that jumps backward", "100 ms back, twice a second", _backward(rng, others))
-    yield against("irregular cycles", "1 to 50 ms, with pauses of 2 s", _irregular(rng, others))
+    yield against("clock that jumps backward", "100 ms back, twice a second", _backward(rng, short_cycles))
+    yield against("irregular cycles", "1 to 50 ms, with pauses of 2 s", _irregular(rng, short_cycles))
     yield against(
         "irregular and dropped frames",
         "two of three lost, 5 to 95 ms late, out of order",
-        _ragged(rng, 2 * others),
+        _ragged(rng, 2 * short_cycles),
     )
     for name, std_n in (("0", 0.0), ("5e-324", 5e-324), ("negative", -1.0)):
         yield against(
-            f"claimed error {name}", "the weight of a frame stays bounded", _steady(rng, others, std_n=std_n)
+            f"claimed error {name}",
+            "the weight of a frame stays bounded",
+            _steady(rng, short_cycles, std_n=std_n),
         )
     for name, force_n, std_n in _REFUSED:
         yield NumericalCase(
             f"estimates of {name}",
             "every second estimate; difference to a filter that does not get them",
-            _effect_of_refused_n(control, gripper, force_n, std_n, config.seed, others),
+            _effect_of_refused_n(control, gripper, force_n, std_n, config.seed, short_cycles),
             0.0,
             "N",
         )
     nothing = {"friction_n": 0.0, "friction_std": 0.0, "gain_std": 0.0}
-    yield against("prior variance 0", "rig parameters known exactly", _steady(rng, others), **nothing)
+    yield against("prior variance 0", "rig parameters known exactly", _steady(rng, short_cycles), **nothing)
     wide = {"friction_std": 1e9, "gain_std": 1e9}
     yield against(
-        "largest prior variance", "10^18 N², the largest that can be configured", _steady(rng, others), **wide
+        "largest prior variance",
+        "10^18 N², the largest that can be configured",
+        _steady(rng, short_cycles),
+        **wide,
     )
     tiny = ((t_ns, 5e-324 * (t_ns // CYCLE_NS % 3), None) for t_ns in range(0, NS_PER_S, CYCLE_NS))
     yield against("denormal currents", "0 to 2 times the smallest double", tiny)

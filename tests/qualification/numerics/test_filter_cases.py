@@ -18,7 +18,7 @@ def inputs() -> Iterator[Input]:
 
 
 def test_every_case_is_within_its_bound() -> None:
-    rows = list(suite.cases(Config(), None, cycles=2000, others=400))
+    rows = list(suite.cases(Config(), None, long_cycles=2000, short_cycles=400))
     assert [row.case for row in rows if not row.ok] == []
     assert len({row.case for row in rows}) == len(rows)
 
