@@ -139,7 +139,7 @@ class ObjectProfile(Section):
         weights: SHA-256 of the file beside it.
         network: File beside it with the network, if it is the profile of a bundle (see `BUNDLED`).
         logs: SHA-256 of each log of the touches.
-        version: Version of this software that made it.
+        version: Version of this software that made it; empty in profiles of version 0.1 and in the shipped ones.
         file: Path of the simulated object's file if the profile is that of a bundle; None if the object has none.
     """
 
