@@ -2,10 +2,11 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from hashlib import sha256
+from itertools import repeat
 from pathlib import Path
 from typing import Final
 
@@ -314,7 +315,7 @@ def fit_and_write(prepared: Prepared, paths: Sequence[Path], progress: Progress)
     progress("computed the learning curve")
     used = [sha256_of(path) for path in with_contact or with_reference]
     profile, crushed_at_n = make_profile(
-        prepared.name, recorded, fit, ResolvedConfig(prepared.config, model), used
+        prepared.name, recorded, fit, ResolvedConfig(prepared.config, model), used, prepared.engine
     )
     write_object(out, profile, pack(fit.arrays))
     report = out.with_suffix(".png")
@@ -341,7 +342,12 @@ def sha256_of(path: Path) -> str:
 
 
 def make_profile(
-    name: str, recorded: TouchRecording, fit: ObjectFit, resolved: ResolvedConfig, logs: Sequence[str]
+    name: str,
+    recorded: TouchRecording,
+    fit: ObjectFit,
+    resolved: ResolvedConfig,
+    logs: Sequence[str],
+    engine: Engine | None = None,
 ) -> tuple[ObjectProfile, float | None]:
     """Makes an object profile of a fit.
 
@@ -351,6 +357,7 @@ def make_profile(
         fit: The fit.
         resolved: Configuration, and the network.
         logs: SHA-256 of each log of the touches.
+        engine: The network's engine, if it is open.
 
     Returns:
         The profile, and the largest force of the touch after which the object stayed narrower, or None.
@@ -362,7 +369,11 @@ def make_profile(
     peaks_n = np.array([force_n.max() for force_n in forces_n])
     crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
     size = resolved.model.header.preprocess.size
-    frames = np.random.default_rng(0).integers(60, 180, (_TIMED_FRAMES, size, size), np.uint8)
+    frame = np.random.default_rng(0).integers(60, 180, (size, size), np.uint8)
+    timed = replace(
+        resolved, config=resolved.config.with_values(vision={"region": None})
+    )  # the frame is cropped
+    compute_ms = estimate_ms(timed, repeat(frame, _TIMED_FRAMES), engine)
     profile = ObjectProfile(
         object=name,
         date=datetime.now(UTC).date(),
@@ -375,7 +386,7 @@ def make_profile(
         interval=fit.interval,
         ood_limits=None if fit.arrays.known is None else fit.arrays.known.limits,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + estimate_ms(resolved, frames) / 1e3),
+        plant=fit_plant(recorded.presses, recorded.delay_s + compute_ms / 1e3),
         before_n=fit.before_n,
         after_n=fit.after_n,
         weights=sha256(pack(fit.arrays)).hexdigest(),

@@ -19,6 +19,7 @@ from typer.testing import CliRunner, Result
 
 from gripper_calibration import touch_logs
 from gripper_calibration.procedures import calibrate_object as job
+from gripper_calibration.procedures import estimate_time
 from gripper_calibration.procedures.calibrate_object import (
     ObjectCalibration,
     calibrate_object,
@@ -125,6 +126,17 @@ def test_command_calibrates_from_one_touch_and_opens_the_engine_once(
     assert largest_n < 6.0
     words = f"grasp --object stapler --profile {profile} --target-n {largest_n / 2:.1f} --set"
     assert f"next: gripper-force {words}" in result.stderr
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_in_real_time_the_open_engine_is_timed_whatever_the_region_of_the_camera(
+    touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(estimate_time, "make_estimator")  # would open a second engine
+    config = load_config(None, [*QUICK, "clock=realtime", "vision.region=[40, 40, 400, 400]"])
+    plant = calibrate_object(config, "stapler", logs=touched[:1], out=tmp_path / "it.yaml").profile.plant
+    assert plant is not None
+    assert plant.delay_ms > 0
 
 
 @pytest.mark.usefixtures("no_figures")
