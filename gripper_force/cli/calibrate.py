@@ -19,7 +19,7 @@ from gripper_force.cli.options import (
     load_settings,
     load_settings_before_rig,
 )
-from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table, weight_table
+from gripper_force.cli.output import calibrate as output
 from gripper_force.errors import ConfigError
 from gripper_force.plugins import require
 from gripper_force.runtime import process
@@ -88,7 +88,7 @@ def load_cell(
             seconds=seconds,
             progress=console.status_text(status),
         )
-    _show_rig(result, as_json)
+    _show_rig(result, output.LOAD_CELL, as_json)
     _next_step(["calibrate", "servo", "--gauge-mm", "MM"], config, set_, path)
 
 
@@ -107,7 +107,7 @@ def jaws(
     settings, _ = load_settings_before_rig(config, set_, {})
     with console.err.status("moving") as status:
         result = job(settings, prompt=console.prompt(yes, status), progress=console.status_text(status))
-    console.show(result, as_json, jaws_table)
+    console.show(result, as_json, output.jaws_table)
     if settings.load_cell.backend == "none":
         words = ["grasp"]
     elif settings.load_cell.backend == "simulated":  # needs no calibration
@@ -145,7 +145,7 @@ def servo(
             prompt=console.prompt(yes, status),
             progress=console.status_text(status),
         )
-    _show_rig(result, as_json)
+    _show_rig(result, output.SERVO, as_json)
     if (text := result.width_remark) is not None:
         console.warn(text)
     words = (
@@ -177,7 +177,9 @@ def weight(
             settings, mass_kg, prompt=console.prompt(yes, status), progress=console.status_text(status)
         )
     console.show(
-        console.jsonable(result) | {"settings": result.settings}, as_json, lambda _: weight_table(result)
+        console.jsonable(result) | {"settings": result.settings},
+        as_json,
+        lambda _: output.weight_table(result),
     )
     if abs(result.ratio - 1) > 0.1:
         console.warn(
@@ -231,7 +233,7 @@ def camera(
         console.warn(
             f"the camera is now another one than that of {text}; teach or calibrate the object again"
         )
-    _show_rig(result, as_json)
+    _show_rig(result, output.CAMERA, as_json)
     seeds = [] if seed is None else ["--seed", str(seed)]
     _next_step(["calibrate", "object", "NAME", *seeds], config, set_, path)
 
@@ -292,7 +294,7 @@ def object_(
             f"runs use the bundle {found.parent} instead, which `teach` made; pass --profile {result.profile_path} to "
             "use this profile, or delete the bundle"
         )
-    console.show(result.as_dict(), as_json, lambda _: object_table(result))
+    console.show(result.as_dict(), as_json, lambda _: output.object_table(result))
     profile = name if out is None and find_object(name) == result.profile_path else result.profile_path
     words = [
         "grasp",
@@ -324,7 +326,7 @@ def network(
     with console.bar("calibrating", 2 * len(logs)) as progress:
         model = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
     fitted = model.model_dump(mode="json", exclude={"mean", "axes"})
-    console.show({"checkpoint": str(out), **fitted}, as_json)
+    console.show({"checkpoint": str(out), **fitted}, as_json, lambda _: output.network_table(str(out), model))
     console.next_step("evaluate", data, "--checkpoint", out)
 
 
@@ -352,7 +354,7 @@ def gain(
     paths = find_logs(logs)
     _tell_other_objects(read_object(find_object(name)).object, paths)
     saved = save_gain(name, paths, out, set_)
-    console.show(saved, as_json)
+    console.show(saved, as_json, output.gain_table)
     target = _safe_target(read_object(saved.profile))
     console.next_step("grasp", "--object", saved.object, "--profile", out or name, *target)
 
@@ -433,7 +435,7 @@ def teach(
         raise
     _tell_left_out(result)
     shown = console.jsonable(result) | {"minutes": (time.monotonic() - begin_s) / 60}
-    console.show(shown, as_json, lambda _: taught_table(result, shown["minutes"]))
+    console.show(shown, as_json, lambda _: output.taught_table(result, shown["minutes"]))
     if result.more_touches_help:
         console.err.print(
             f"more touches would reduce the error further: --touches {2 * len(result.profile.logs)} adds to these",
@@ -546,11 +548,13 @@ def _next_step(
     console.next_step(*words, *again(config, keys))
 
 
-def _show_rig(result: "LoadCellResult | ServoResult | CameraResult", as_json: bool) -> None:
+def _show_rig(
+    result: "LoadCellResult | ServoResult | CameraResult", names: Mapping[str, str], as_json: bool
+) -> None:
     """Shows the calibrated section of the rig profile and what else was measured, as one level of keys."""
     values = console.jsonable(result)
     shown = values.pop("calibration") | values
-    console.show(shown, as_json, lambda _: rig_table({k: v for k, v in shown.items() if k != "outdated"}))
+    console.show(shown, as_json, lambda _: output.rig_table(shown, names))
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

@@ -33,6 +33,9 @@ if not out.is_terminal:
 _SPEED_S: Final = 3600.0
 """Time over which the speed of a job is averaged: a step of a training or of a matrix may take minutes."""
 
+_UNITS: Final = {"n": "N", "s": "s", "ms": "ms", "mb": "MB", "mb_h": "MB/h", "percent": "%"}
+_NAMES: Final = {"mae": "MAE", "rmse": "RMSE"}
+
 T = TypeVar("T")
 
 
@@ -174,7 +177,7 @@ def show(result: T, as_json: bool, render: Callable[[T], object] | None = None) 
     if as_json:
         sys.stdout.write(json.dumps(jsonable(result), allow_nan=False) + "\n")
     elif render is None:
-        pairs(jsonable(result))
+        pairs({words(name): value for name, value in jsonable(result).items()})
     else:
         render(result)
 
@@ -228,6 +231,14 @@ def number(value: object, unit: str = "", digits: int = 3) -> str:
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
+
+
+def words(key: str) -> str:
+    """Returns a key of JSON in plain words, with its unit at the end: ``mae_n`` as ``MAE, N``."""
+    for suffix, unit in _UNITS.items():
+        if key.endswith(f"_{suffix}"):
+            return f"{words(key.removesuffix(f'_{suffix}'))}, {unit}"
+    return " ".join(_NAMES.get(word, word) for word in key.split("_"))
 
 
 def pairs(values: Mapping[str, object]) -> None:

@@ -210,7 +210,9 @@ def _show_trained(
     if figure is not None:
         found["figure"] = str(figure)
     console.show(
-        {**found, "left_out": left_out, "warnings": warnings}, as_json, lambda _: console.pairs(found)
+        {**found, "left_out": left_out, "warnings": warnings},
+        as_json,
+        lambda _: console.pairs({console.words(key): value for key, value in found.items()}),
     )
     console.next_step("evaluate", "FOLDER", "--checkpoint", path)
 
@@ -319,7 +321,17 @@ def export_network(
         frames = [clip.frames for clip in clips]
     with console.err.status("exporting"):
         errors = job(model, out) if frames is None else export_int8(model, out, frames)
-    console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
+    console.show(
+        {"file": str(out), "digest": model.digest, "off_torch_n": errors},
+        as_json,
+        lambda _: console.pairs(
+            {
+                "file": str(out),
+                "digest": model.digest,
+                "difference from PyTorch": f"{errors['largest_n']:.2g} N at most, {errors['mean_n']:.2g} N on average",
+            }
+        ),
+    )
     engine = EXPORTED[out.suffix]
     console.next_step("grasp", "--set", f"vision.checkpoint={out}", "--set", f"vision.engine={engine}")
 

@@ -18,12 +18,14 @@ import typer
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures import calibrate_jaws, calibrate_servo
+from gripper_calibration.procedures.calibrate_camera import CameraResult
 from gripper_calibration.procedures.calibrate_jaws import JawsResult
+from gripper_calibration.procedures.calibrate_load_cell import LoadCellResult
 from gripper_calibration.procedures.calibrate_servo import ServoResult
 from gripper_force import cli
 from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
-from gripper_force.cli.output.calibrate import rig_table
+from gripper_force.cli.output import calibrate as output
 from gripper_force.cli.output.runs import grasp_table, trials_table
 from gripper_force.config import Config, load_config
 from gripper_force.control.limits import largest_target_n
@@ -32,9 +34,15 @@ from gripper_force.jobs import cpu
 from gripper_force.jobs.grasp import PAPER_OBJECTS, GraspSummary, summarise_grasp
 from gripper_force.jobs.profile_files import update_rig
 from gripper_force.jobs.trials import TrialsSummary
-from gripper_force.profiles.rig_profile import CalibratedValue, ServoCalibration
+from gripper_force.profiles.rig_profile import (
+    CalibratedValue,
+    CameraCalibration,
+    LoadCellCalibration,
+    ServoCalibration,
+)
 from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
+from gripper_force.schema import Section
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.pty_server import BenchMotor, PtyServer
@@ -992,9 +1000,41 @@ def test_a_table_of_trials_fits_80_columns_without_a_broken_word(
 
 
 def test_a_setting_that_a_camera_lacks_is_not_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    rig_table({"image": {"sensor": None, "fourcc": "MJPG"}, "other": {"sensor": None}})
+    names = {"image": "settings", "other": "other"}
+    output.rig_table({"image": {"sensor": None, "fourcc": "MJPG"}, "other": {"sensor": None}}, names)
     shown = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert shown == [["image", "fourcc", "MJPG"], ["other", "-"]]
+    assert shown == [["settings", "fourcc", "MJPG"], ["other", "-"]]
+
+
+@pytest.mark.parametrize(
+    ("section", "result", "names"),
+    [
+        (LoadCellCalibration, LoadCellResult, output.LOAD_CELL),
+        (ServoCalibration, ServoResult, output.SERVO),
+        (CameraCalibration, CameraResult, output.CAMERA),
+    ],
+)
+def test_each_value_of_a_calibration_is_named_in_plain_words(
+    section: type[Section], result: Any, names: dict[str, str]
+) -> None:
+    keys = {*section.model_fields, *result.__dataclass_fields__} - {"calibration", "outdated"}
+    assert names.keys() == keys
+    assert not any("_" in name for name in names.values())
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("held", "held"),
+        ("fell_back", "fell back"),
+        ("rmse_n", "RMSE, N"),
+        ("median_error_percent", "median error, %"),
+        ("slope_mb_h", "slope, MB/h"),
+        ("n", "n"),
+    ],
+)
+def test_a_key_of_json_is_shown_as_plain_words_with_its_unit(key: str, words: str) -> None:
+    assert console.words(key) == words
 
 
 @pytest.mark.parametrize(("result", "told"), [("timeout", True), ("held", False)])

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
@@ -14,12 +14,76 @@ if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_object import ObjectCalibration
     from gripper_calibration.procedures.calibrate_weight import WeightResult
     from gripper_calibration.procedures.teach import Taught
+    from gripper_force.jobs.object_gain import SavedGain
     from gripper_force.profiles.object_profile import Interval
+    from gripper_force.vision.header import OodModel
 
 
-def rig_table(r: Mapping[str, object]) -> None:
-    """Prints the calibrated values of a rig, each with its 95 % interval."""
-    pairs({name: _found(value) for name, value in r.items()})
+LOAD_CELL: Final = {
+    "date": "date",
+    "sensor": "sensor",
+    "tare_raw": "reading without load",
+    "n_per_raw": "newtons per unit of the reading",
+    "force_n": "calibrated forces, N",
+    "noise_n": "noise, N",
+    "drift_n_min": "drift, N/min",
+    "return_n": "change of the empty reading, N",
+    "rejected": "readings not used",
+    "rig": "rig profile",
+    "report": "figure",
+}
+SERVO: Final = {
+    "date": "date",
+    "model": "servo",
+    "nm_per_a": "torque constant, Nm/A",
+    "friction_n": "friction, N",
+    "damping_n_s_m": "damping, N s/m",
+    "pinion_radius_m": "radius of the pinion, m",
+    "open_position_rad": "angle of the open jaws, rad",
+    "open_width_m": "width between the open jaws, m",
+    "force_n": "calibrated forces, N",
+    "speed_m_s": "calibrated speeds, m/s",
+    "residual_n": "residual of the fit, N",
+    "n_per_a": "force per current, N/A",
+    "friction_share": "growth of friction with the force",
+    "free_friction_n": "friction in free travel, N",
+    "lag_s": "lag from current to force, s",
+    "offset_a": "offset of the current, A",
+    "presses": "presses",
+    "passes": "passes of free travel",
+    "width_shift_m": "change of all widths, m",
+    "rig": "rig profile",
+    "report": "figure",
+}
+CAMERA: Final = {
+    "date": "date",
+    "backend": "camera",
+    "side_px": "side of the frames, px",
+    "rate_hz": "frame rate, Hz",
+    "gain": "gain",
+    "image": "other settings",
+    "exposure_us": "exposure, us",
+    "mean": "mean gray value",
+    "clipped": "share of clipped pixels",
+    "region": "region: left, top, width, height, px",
+    "markers": "region by markers",
+    "lag_ms": "lag behind the load cell, ms",
+    "delay_ms": "delay from force to estimate, ms",
+    "reference": "image of the open jaws",
+    "correlation_lag_ms": "lag by correlation, ms",
+    "use_ms": "time from frame to control, ms",
+    "compute_ms": "time of an estimate, ms",
+    "touches": "touches",
+    "touches_that_tell": "touches that show the lag",
+    "rig": "rig profile",
+    "report": "figure",
+}
+"""Plain words for each key of the commands' JSON, with the unit."""
+
+
+def rig_table(r: Mapping[str, object], names: Mapping[str, str]) -> None:
+    """Prints the calibrated values of a rig that have a name, each with its 95 % interval."""
+    pairs({name: _found(r[key]) for key, name in names.items()})
 
 
 def jaws_table(r: "JawsResult") -> None:
@@ -49,7 +113,7 @@ def weight_table(r: "WeightResult") -> None:
 
 def _found(value: object) -> object:
     if isinstance(value, list):
-        return ", ".join(f"{item:.5g}" for item in value)
+        return (" to " if len(value) == 2 else ", ").join(f"{item:.5g}" for item in value)
     if not isinstance(value, dict):
         return value
     if "low" not in value:  # settings
@@ -58,6 +122,32 @@ def _found(value: object) -> object:
     if value["low"] is None:
         return f"{value['value']:.6g} (given)"
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"
+
+
+def network_table(checkpoint: str, model: "OodModel") -> None:
+    """Prints the out-of-distribution score that a network has got."""
+    claimed = [model.std_base, math.hypot(model.std_base, model.std_growth)]
+    pairs(
+        {
+            "checkpoint": checkpoint,
+            "limits of the score": ", ".join(
+                f"{one.limit:.2f} at {one.force_n:.1f} N" for one in model.limits
+            ),
+            "factor of the claimed error": f"{claimed[0]:.2f} for known frames, {claimed[1]:.2f} at the limit",
+        }
+    )
+
+
+def gain_table(r: "SavedGain") -> None:
+    """Prints the gain of an object that was saved."""
+    pairs(
+        {
+            "object": r.object,
+            "gain": f"{r.object_gain:.2f} +- {100 * r.object_gain_std:.0f} %",
+            "motor current over vision": f"{r.ratio:.2f} +- {100 * r.ratio_std:.0f} %",
+            "profile": str(r.profile),
+        }
+    )
 
 
 def _interval(interval: "Interval") -> str:
@@ -121,7 +211,7 @@ def taught_table(r: "Taught", minutes: float) -> None:
             "interval": _interval(profile.interval),
             "coverage": _coverage(r.coverages),
             "touches": f"{profile.touches}, up to {profile.force_n:.1f} N",
-            "time": f"{minutes:.1f} min",
+            "time of this call": f"{minutes:.1f} min",
             "bundle": str(r.bundle),
             "figure": str(r.figure),
         }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Column, Table
 
-from gripper_force.cli.console import number, out, pairs
+from gripper_force.cli.console import number, out, pairs, words
 
 if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.evaluate import Evaluation
@@ -59,7 +59,7 @@ def grasp_table(r: "GraspSummary") -> None:
 def _vision(r: "GraspSummary") -> dict[str, str]:
     if r["vision_share"] is None:
         return {}
-    losses = "\n".join(f"for {loss.time_s:.1f} s: {loss.reason}" for loss in r["vision_losses"])
+    losses = "\n".join(map(str, r["vision_losses"]))
     gain = {} if r["object_gain"] is None else {"object's gain": _gain(r)}
     return {
         "vision used": f"{100 * r['vision_share']:.0f} % of the hold",
@@ -79,6 +79,8 @@ def trials_table(
     trials: "Sequence[GraspSummary]", summary: "TrialsSummary", figure: str | None = None
 ) -> None:
     """Prints the figures of each trial and over all trials."""
+    from gripper_force.jobs.trials import WITHIN_N, WITHIN_SHARE
+
     # 80 columns must do.
     units = ("target\nN", "load cell\nN", "error\n%", "overshoot\nN", "settle\ns", "vision\n%")
     table = _table("object", *units, "gain", "result")
@@ -102,9 +104,13 @@ def trials_table(
             f"{summary['fell_back']} of {summary['trials']} trials fell back to motor current: less than half of "
             f"their hold used vision. They {'are left out of' if left_out else 'count in'} the errors."
         )
-    plain = {key: value for key, value in summary.items() if key != "estimate_mae_n"}
+    names = {
+        "good_percent": f"within {100 * WITHIN_SHARE:g} % or {WITHIN_N:g} N, %",
+        "over_limit": "above the force limit",
+    }
+    plain = {names.get(key) or words(key): value for key, value in summary.items() if key != "estimate_mae_n"}
     if summary["peak_n"] is None:
-        pairs({key: value for key, value in plain.items() if value is not None})
+        pairs({name: value for name, value in plain.items() if value is not None})
         out.print("No load cell: force errors, overshoot and peaks can't be measured.")
         return
     pairs(plain)
@@ -118,7 +124,7 @@ def trials_table(
 
 def errors_table(r: "Evaluation") -> None:
     """Prints errors of estimates: over all frames, by object and by force."""
-    pairs({key: getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
+    pairs({words(key): getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
     table = _table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames")
     for name, o in r.per_object.items():
         figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
