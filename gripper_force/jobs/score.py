@@ -60,8 +60,6 @@ MIN_VISION_SHARE: Final = 0.5
 """A grasp that is configured to use vision fell back if a smaller share of its hold used it."""
 
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")
-_MEASURED: Final = re.compile(r"\d (N|ms old)$")
-"""End of a reason with a value of one estimate, which may differ in the estimates after it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +68,10 @@ class VisionLoss:
 
     reason: str
     time_s: float
+
+    def __str__(self) -> str:
+        """Returns both for people. A number in the reason is that of the first estimate that was not used."""
+        return f"for {self.time_s:.1f} s: {'at first ' if _NUMBER.search(self.reason) else ''}{self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +155,7 @@ def vision_in_hold(
 ) -> HoldVision | None:
     """Computes the use of vision in the hold of the last grasp of a run; None without a hold.
 
-    Reasons that differ in their numbers only count as one, with the numbers of the longest: those of the first estimate
-    that was not used.
+    Reasons that differ in their numbers only count as one, with the numbers of the longest.
 
     Args:
         statuses: States of the controller in order of time.
@@ -179,7 +180,6 @@ def vision_in_hold(
             continue
         before = bisect_right(reasons, status.t_ns, key=lambda entry: entry[0])
         reason = reasons[before - 1][1] if before else "no estimate was used"
-        reason += " at first" if _MEASURED.search(reason) else ""
         lost_s[_NUMBER.sub("", reason)][reason] += (after.t_ns - status.t_ns) / NS_PER_S
     losses = [VisionLoss(max(same, key=same.__getitem__), sum(same.values())) for same in lost_s.values()]
     return HoldVision(used / cycles, sorted(losses, key=lambda loss: -loss.time_s))

@@ -303,7 +303,7 @@ def test_the_figure_states_why_vision_was_lost(grasp: Path) -> None:
     run = dataclasses.replace(
         read_run(LogReader(grasp)), vision=HoldVision(0.956, [VisionLoss("it is 70 ms old", 0.42)])
     )
-    text = "vision used in 96 % of the hold\nvision lost for 0.4 s: it is 70 ms old"
+    text = "vision used in 96 % of the hold\nvision lost for 0.4 s: at first it is 70 ms old"
     assert draw(run, []).get_supxlabel() == text
     assert draw(dataclasses.replace(run, vision=None), []).get_supxlabel() == ""
 

@@ -3,7 +3,7 @@ import math
 import pytest
 
 from gripper_force.errors import DataError
-from gripper_force.jobs.score import score_grasp, vision_in_hold
+from gripper_force.jobs.score import VisionLoss, score_grasp, vision_in_hold
 from gripper_force.types import Event, FusedForce, GraspStatus, LoadCellSample, Phase, VisualForce
 
 MS = 1_000_000
@@ -112,7 +112,7 @@ def test_share_of_vision_counts_the_hold_of_the_last_grasp():
     used = vision_in_hold(
         states, fused(states, lambda i: i >= 425), [], told((90, dropped("it is 70 ms old")))
     )
-    assert rounded(used) == (0.75, [("it is 70 ms old at first", 0.25)])
+    assert rounded(used) == (0.75, [("it is 70 ms old", 0.25)])
 
 
 def test_losses_are_summed_by_reason_and_the_longest_comes_first():
@@ -125,10 +125,7 @@ def test_losses_are_summed_by_reason_and_the_longest_comes_first():
         (160, dropped("it jumps by 1.10 N")),
     )
     used = vision_in_hold(states, fused(states, lambda i: i not in lost), [], events)
-    losses = [
-        ("it differs from the motor current by 1.20 N at first", 0.3),
-        ("it jumps by 1.10 N at first", 0.25),
-    ]
+    losses = [("it differs from the motor current by 1.20 N", 0.3), ("it jumps by 1.10 N", 0.25)]
     assert rounded(used) == (0.45, losses)
 
 
@@ -145,3 +142,8 @@ def test_vision_that_was_never_used_is_a_loss_too():
     states = statuses(Phase.HOLD, Phase.RELEASE)
     used = vision_in_hold(states, fused(states, lambda _: False), [], [])
     assert rounded(used) == (0.0, [("no estimate was used", 1.0)])
+
+
+def test_a_loss_says_that_a_number_in_its_reason_is_that_of_its_first_estimate():
+    assert str(VisionLoss("it jumps by -0.90 N", 0.25)) == "for 0.2 s: at first it jumps by -0.90 N"
+    assert str(VisionLoss("no new estimate", 1.0)) == "for 1.0 s: no new estimate"

@@ -195,7 +195,7 @@ def with_gaps(series: Series) -> Series:
 def _vision_lines(run: Run) -> list[str]:
     if run.vision is None:
         return []
-    losses = [f"vision lost for {loss.time_s:.1f} s: {loss.reason}" for loss in run.vision.losses]
+    losses = [f"vision lost {loss}" for loss in run.vision.losses]
     return [f"vision used in {100 * run.vision.share:.0f} % of the hold", *losses]
 
 
