@@ -16,7 +16,7 @@ from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_ce
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_calibration.procedures.servo_measurement import measure
 from gripper_force.cli import app
-from gripper_force.cli.output.calibrate import rig_table
+from gripper_force.cli.output.calibrate import SERVO, rig_table
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError, RequestError
 from gripper_force.jobs.grasp import run_grasp
@@ -302,9 +302,10 @@ def test_load_cell_that_leaves_the_jaws_during_a_press_does_not_let_them_shut_fa
 
 def test_table_shows_values_with_intervals(capsys: pytest.CaptureFixture[str]) -> None:
     measured, given = {"value": 1.7, "low": 1.6, "high": 1.8}, {"value": 0.02, "low": None, "high": None}
-    rig_table({"nm_per_a": measured, "pinion_radius_m": given, "force_n": [0.3, 9.5]})
+    values = {"nm_per_a": measured, "pinion_radius_m": given, "force_n": [0.3, 9.5]}
+    rig_table(values, {key: SERVO[key] for key in values})
     printed = capsys.readouterr().out
-    for told in ("1.7 (1.6 to 1.8)", "0.02 (given)", "0.3, 9.5"):
+    for told in ("torque constant, Nm/A", "1.7 (1.6 to 1.8)", "0.02 (given)", "0.3 to 9.5"):
         assert told in printed
 
 
