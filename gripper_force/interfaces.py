@@ -55,11 +55,9 @@ class Lock(Protocol):
 
     def acquire(self, *, timeout: float) -> bool:
         """Waits up to ``timeout`` seconds for the lock, and returns whether it was acquired."""
-        ...
 
     def release(self) -> None:
         """Releases the lock."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,35 +85,28 @@ class Servo(Protocol):
     @property
     def stats(self) -> BusStats:
         """Counters of cycles, retries and losses."""
-        ...
 
     @staticmethod
     def spec(config: ServoConfig) -> ServoSpec:
         """Returns the data of the configured model, without a connection. Raises `ConfigError`."""
-        ...
 
     def start(self) -> ServoState:
         """Checks the model, sets mode and limits, reads them back, arms the watchdog and turns torque on.
 
         The present position is the goal when torque turns on, so nothing moves. If this raises, torque is off.
         """
-        ...
 
     def read(self) -> ServoState:
         """Reads a `ServoState`, in one bus transaction if all of it fits."""
-        ...
 
     def write(self, command: ServoCommand) -> None:
         """Writes goal current and goal position in one bus transaction. Raises `NonFiniteError`."""
-        ...
 
     def stop(self, *, hold: bool) -> None:
         """Ends a run: turns torque off, or with ``hold`` keeps the goals and disarms the watchdog."""
-        ...
 
     def close(self) -> None:
         """Releases the port without changing the torque. May be called twice."""
-        ...
 
 
 class Camera(Protocol):
@@ -129,19 +120,15 @@ class Camera(Protocol):
 
     def start(self) -> None:
         """Opens the device and starts to capture."""
-        ...
 
     def newest(self) -> Frame | None:
         """Returns the newest frame that was not returned before, or None. Never blocks."""
-        ...
 
     def counts(self) -> dict[str, int]:
         """Returns the number of problems since construction by cause."""
-        ...
 
     def close(self) -> None:
         """Stops capturing. May be called twice."""
-        ...
 
 
 class LoadCell(Protocol):
@@ -153,19 +140,15 @@ class LoadCell(Protocol):
 
     def start(self) -> None:
         """Opens the device and starts to sample."""
-        ...
 
     def drain(self) -> list[LoadCellSample]:
         """Returns all samples since the last call, oldest first. Never blocks."""
-        ...
 
     def counts(self) -> dict[str, int]:
         """Returns the number of problems since construction by cause."""
-        ...
 
     def close(self) -> None:
         """Stops sampling. May be called twice."""
-        ...
 
 
 class Clock(Protocol):
@@ -173,11 +156,9 @@ class Clock(Protocol):
 
     def now_ns(self) -> int:
         """Returns the monotonic time in nanoseconds."""
-        ...
 
     def sleep_until_ns(self, t_ns: int) -> None:
         """Waits until ``t_ns``. In lockstep this advances the simulated world."""
-        ...
 
 
 class WorldState(NamedTuple):

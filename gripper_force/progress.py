@@ -13,7 +13,6 @@ class Progress(Protocol):
             text: What is being done, for a person.
             steps: Steps of the announced total that were finished since the last call; 0 for none.
         """
-        ...
 
 
 class Prompt(Protocol):
@@ -21,7 +20,6 @@ class Prompt(Protocol):
 
     def __call__(self, text: str) -> None:
         """Shows an instruction and returns once the person has confirmed it."""
-        ...
 
 
 def no_progress(text: str, steps: int = 1) -> None:

@@ -34,15 +34,12 @@ class Linkage(Protocol):
 
     def width_m(self, closing_rad: float) -> float:
         """Returns the distance between the jaws at a closing angle."""
-        ...
 
     def closing_rad(self, width_m: float) -> float:
         """Returns the closing angle at a distance between the jaws."""
-        ...
 
     def jaw_m_per_rad(self, closing_rad: float) -> float:
         """Returns half of the width's decrease per radian: the travel of each of two jaws."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,11 +50,9 @@ class Plan(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """File names of the logs, relative to the output folder."""
-        ...
 
     def check(self, out: Path, config: Tree) -> None:
         """Raises `DataError` if existing logs were made with another configuration; see `make`."""
-        ...
 
     def make(self, out: Path, config: Tree) -> list[Path]:
         """Makes the logs that do not exist yet.
@@ -63,7 +61,6 @@ class Plan(Protocol):
             out: Output folder.
             config: Configuration as plain data, which can be sent to another process.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,9 @@ class Estimator(Protocol):
 
     def update(self, gray: Gray) -> ForceEstimate | None:
         """Takes the next frame; returns None while the reference is being collected."""
-        ...
 
     def attention_map(self) -> npt.NDArray[np.float32] | None:
         """Returns the attention over the newest frame, (h, w) in 0..1, or None."""
-        ...
 
 
 class ProcessedFrame(NamedTuple):
@@ -103,15 +101,12 @@ class Perception(Protocol):
 
     def start(self) -> None:
         """Starts the processing."""
-        ...
 
     def poll(self) -> list[ProcessedFrame]:
         """Returns the frames that became ready since the last call, oldest first."""
-        ...
 
     def close(self) -> None:
         """Stops the processing. May be called twice."""
-        ...
 
 
 class LockstepPerception:

@@ -16,26 +16,21 @@ class Person(Protocol):
 
     def tell(self, text: str) -> None:
         """Shows a remark."""
-        ...
 
     def do(self, text: str) -> None:
         """Asks for an action and returns once it is done."""
-        ...
 
     def agrees(self, question: str) -> bool:
         """Asks a question whose answer is yes or no. A script answers yes."""
-        ...
 
     def choose(self, question: str, answers: Sequence[str], option: str) -> str:
         """Returns one of the answers. A script can't choose: `ConfigError` names its ``option``."""
-        ...
 
     def number(self, question: str, option: str, default: float | None = None) -> float:
         """Returns a number that `is_answer` accepts.
 
         A script takes the default; without one `ConfigError` names its ``option``.
         """
-        ...
 
 
 def is_answer(number: float, default: float | None) -> bool:

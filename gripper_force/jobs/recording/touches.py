@@ -16,11 +16,9 @@ class TouchSession(Protocol):
     @property
     def last_load_cell_sample(self) -> LoadCellSample | None:
         """Newest valid sample of the load cell."""
-        ...
 
     def cycle(self, kind: RequestKind | None = None, target_n: float = 0.0) -> Decision:
         """Runs the next control cycle, with a request or without."""
-        ...
 
 
 def touch(

@@ -38,11 +38,9 @@ class Viewer(Protocol):
 
     def show(self, log: LogReader, record: Record) -> None:
         """Shows the next record of a log."""
-        ...
 
     def close(self) -> None:
         """Sends everything, and ends the connection."""
-        ...
 
 
 def require(viewer: str) -> None:

@@ -34,11 +34,9 @@ class Port(Protocol):
 
     def closePort(self) -> None:  # noqa: N802
         """Releases the port. May be called twice."""
-        ...
 
     def drain(self) -> None:
         """Discards received bytes until the reply timeout ends."""
-        ...
 
 
 def open_port(name: str, baud_rate: int, reply_margin_ms: float) -> Port:

@@ -97,7 +97,6 @@ class Motor(Protocol):
             velocity_rad_s: Angular velocity of the horn.
             current_noise_a: Error of the current's measurement in this step.
         """
-        ...
 
 
 @dataclass(frozen=True)
