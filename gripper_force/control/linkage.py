@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Final, Protocol
+from typing import Final
 
 from gripper_force.config import GripperConfig, LinkageConfig
 from gripper_force.errors import ConfigError
@@ -27,19 +27,6 @@ _DIFFERENCE_RAD: Final = 1e-5
 _MIN_SHARE: Final = 0.1
 """Least travel per radian as a share of the greatest. Below it the linkage is near its dead centre, where the
 force by the motor current is arbitrarily wrong."""
-
-
-class Linkage(Protocol):
-    """Relation between the closing angle and the width."""
-
-    def width_m(self, closing_rad: float) -> float:
-        """Returns the distance between the jaws at a closing angle."""
-
-    def closing_rad(self, width_m: float) -> float:
-        """Returns the closing angle at a distance between the jaws."""
-
-    def jaw_m_per_rad(self, closing_rad: float) -> float:
-        """Returns half of the width's decrease per radian: the travel of each of two jaws."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +50,7 @@ class RackAndPinion:
         return (self.open_width_m - width_m) / (2 * self.radius_m)
 
     def jaw_m_per_rad(self, closing_rad: float) -> float:
-        """Returns the travel of one jaw per radian."""
+        """Returns half of the width's decrease per radian: the travel of each of two jaws."""
         return self.radius_m
 
 
@@ -99,7 +86,7 @@ class TabulatedLinkage:
         return closing_rad + (inside_m - width_m) / (2 * self.jaw_m_per_rad(closing_rad))
 
     def jaw_m_per_rad(self, closing_rad: float) -> float:
-        """Returns the travel of one jaw per radian."""
+        """Returns half of the width's decrease per radian: the travel of each of two jaws."""
         i, share = self._interval(closing_rad)
         share = min(max(share, 0.0), 1.0)
         return self.jaw_m_per_rads[i] + share * (self.jaw_m_per_rads[i + 1] - self.jaw_m_per_rads[i])
@@ -107,6 +94,10 @@ class TabulatedLinkage:
     def _interval(self, closing_rad: float) -> tuple[int, float]:
         i = min(max(int(closing_rad / self.step_rad), 0), len(self.widths_m) - 2)
         return i, closing_rad / self.step_rad - i
+
+
+Linkage = RackAndPinion | TabulatedLinkage
+"""Relation between the closing angle and the width."""
 
 
 @lru_cache(maxsize=8)

@@ -96,19 +96,6 @@ def _attention(frame: Frame, ready_ns: int, estimator: Estimator) -> AttentionMa
     return AttentionMap(frame.t_ns, ready_ns, frame.seq, np.rint(255 * scaled).astype(np.uint8))
 
 
-class Perception(Protocol):
-    """Source of processed frames for a session."""
-
-    def start(self) -> None:
-        """Starts the processing."""
-
-    def poll(self) -> list[ProcessedFrame]:
-        """Returns the frames that became ready since the last call, oldest first."""
-
-    def close(self) -> None:
-        """Stops the processing. May be called twice."""
-
-
 class LockstepPerception:
     """Processes frames in the caller's thread; estimates are ready after a fixed simulated time."""
 
@@ -179,3 +166,7 @@ class ThreadedPerception:
                 self._done.append(self._processor.process(frame, self._clock.now_ns))
         except Exception as error:  # re-raised in the control thread
             self._failure = error
+
+
+Perception = LockstepPerception | ThreadedPerception
+"""Source of processed frames for a session."""
