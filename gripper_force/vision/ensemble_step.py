@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.gaussian_process import GaussianProcess
 from gripper_force.vision.header import GaussianProcessConfig, NetworkConfig
-from gripper_force.vision.network import ForceNetwork, StreamState
+from gripper_force.vision.network import ForceNetwork, Output, StreamState
 
 FRAME: Final = "frame"
 FORCE: Final = "force_n"
@@ -40,51 +40,42 @@ class EnsembleStep(nn.Module):
 
     def forward(self, frame: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Runs all members on the next frame; shapes as in the class."""
-        forces: list[Tensor] = []
-        features: list[Tensor] = []
-        gates: list[Tensor | None] = []
+        outputs: list[Output] = []
         next_states: list[Tensor] = []
         inputs = list(state)
         for member in self.members:
             if isinstance(member, GaussianProcess):
-                output = member.step(frame)
-                forces.append(output.force_n)
-                features.append(output.features[0])
-                gates.append(None)
+                outputs.append(member.step(frame))
                 continue
             assert isinstance(member, ForceNetwork)
-            config = member.config
-            # Without earlier frames there is no maps input: engines do not take tensors of size zero.
-            maps = inputs.pop(0) if config.maps_kept else member.zero_state().maps
+            first = _first_state(member.config)
+            maps = member.zero_state().maps if first else inputs.pop(0)
             output, state_after = member.step(frame, StreamState(maps, inputs.pop(0), inputs.pop(0)))
-            forces.append(output.force_n)
-            features.append(output.features[0])
-            gates.append(output.gates)
-            next_states += state_after if config.maps_kept else state_after[1:]
-        attention = [] if self._ssam_member is None else [_map(gates[self._ssam_member])]
-        return torch.cat(forces), torch.cat(features), *attention, *next_states
+            outputs.append(output)
+            next_states += state_after[first:]
+        attention = [] if self._ssam_member is None else [_map(outputs[self._ssam_member].gates)]
+        forces_n = torch.cat([output.force_n for output in outputs])
+        features = torch.cat([output.features[0] for output in outputs])
+        return forces_n, features, *attention, *next_states
 
     def zero_states(self) -> list[Tensor]:
         """Returns states of zeros, in the order in which `forward` takes them."""
-        states: list[Tensor] = []
-        for member in self.members:
-            if isinstance(member, GaussianProcess):
-                continue
-            assert isinstance(member, ForceNetwork)
-            state = member.zero_state()
-            states += state if member.config.maps_kept else state[1:]
-        return states
+        networks = [member for member in self.members if isinstance(member, ForceNetwork)]
+        return [part for one in networks for part in one.zero_state()[_first_state(one.config) :]]
 
 
 def state_names(members: Sequence[NetworkConfig | GaussianProcessConfig]) -> list[str]:
     """Returns the names of an ensemble's states, in the order in which `EnsembleStep` takes them."""
-    names = []
-    for i, config in enumerate(members):
-        if isinstance(config, GaussianProcessConfig):
-            continue
-        names += [f"maps_{i}"] if config.maps_kept else []
-        names += [f"hidden_{i}", f"cell_{i}"]
-    return names
+    networks = [(i, config) for i, config in enumerate(members) if isinstance(config, NetworkConfig)]
+    return [f"{name}_{i}" for i, config in networks for name in StreamState._fields[_first_state(config) :]]
+
+
+def _first_state(config: NetworkConfig) -> int:
+    """Index of the first part of a network's `StreamState` that is an input.
+
+    Without earlier frames there are no maps: engines do not take tensors of size zero.
+    """
+    return 0 if config.maps_kept else 1
 
 
 def _map(gates: Tensor | None) -> Tensor:
