@@ -167,15 +167,14 @@ def resolve_vision(config: Config) -> tuple[Config, Model | None, str]:
         return config, None, ""
     from gripper_force.vision.model_files import read_model
 
-    choice = None
+    choice = ""
     if "auto" in (config.vision.checkpoint, config.vision.engine):
         from gripper_force.vision.selection import resolve_auto
 
-        vision, choice = resolve_auto(
-            config.vision, config.budget, set_threads=allowed_options().torch_threads
-        )
+        threads = allowed_options().torch_threads
+        vision, choice = resolve_auto(config.vision, config.budget, set_threads=threads)
         config = config.with_values(vision=vision)
-    return config, read_model(config.vision.checkpoint), "" if choice is None else str(choice)
+    return config, read_model(config.vision.checkpoint), choice
 
 
 def make_estimator(resolved: ResolvedConfig) -> ForceEstimator | None:

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -23,57 +23,38 @@ from gripper_force.vision.step_benchmark import (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The candidate that replaces ``auto``. Its text names it and says why it was chosen.
-
-    Attributes:
-        candidate: The chosen candidate.
-        tested: Number of candidates it was chosen from.
-        reason: Criterion of the choice.
-    """
-
-    candidate: EngineCandidate
-    tested: int
-    reason: str
-
-    def __str__(self) -> str:
-        """Returns the choice as a sentence."""
-        return f"chose {self.candidate} ({self.reason} of {self.tested} candidates)"
-
-
 @lru_cache
 def resolve_auto(
     vision: VisionConfig, budget: BudgetConfig, *, set_threads: bool = False
-) -> tuple[VisionConfig, Choice | None]:
+) -> tuple[VisionConfig, str]:
     """Replaces ``auto`` in a configuration. Measures the candidates that this machine has not measured yet.
 
     Args:
-        vision: The configuration.
+        vision: A configuration with ``auto`` as its checkpoint, its engine or both.
         budget: Limits that the choice must keep.
         set_threads: See `candidates`.
 
     Returns:
-        The configuration without ``auto``, and the choice; None if there was no ``auto``.
+        The configuration without ``auto``, and a sentence about the choice.
 
     Raises:
         ConfigError: No installed engine can run the network, or no candidate keeps the budget.
     """
-    if vision.checkpoint == "none" or "auto" not in (vision.checkpoint, vision.engine):
-        return vision, None
     tested = candidates(vision, set_threads=set_threads)
     if not tested:
         raise ConfigError(
             f"no installed engine runs vision.checkpoint={vision.checkpoint} with vision.engine={vision.engine} and "
             f"vision.precision={vision.precision}; pip install 'gripper-force[engines]', or set other values"
         )
-    choice = select(tested, budget)
+    chosen, sentence = select(tested, budget)
     keys = ("checkpoint", "engine", "precision", "threads")
-    return vision.model_copy(update={key: getattr(choice.candidate, key) for key in keys}), choice
+    return vision.model_copy(update={key: getattr(chosen, key) for key in keys}), sentence
 
 
-def select(tested: Sequence[EngineCandidate], budget: BudgetConfig) -> Choice:
-    """Selects the cheapest candidate within the budget; without a budget, the fastest of the most accurate.
+def select(tested: Sequence[EngineCandidate], budget: BudgetConfig) -> tuple[EngineCandidate, str]:
+    """Returns the cheapest candidate within the budget, and a sentence about the choice.
+
+    Without a budget it is the fastest of the most accurate.
 
     Raises:
         ConfigError: No candidate keeps the budget.
@@ -89,12 +70,12 @@ def select(tested: Sequence[EngineCandidate], budget: BudgetConfig) -> Choice:
         front = "; ".join(str(candidate) for candidate in pareto_front(tested))
         raise ConfigError(f"no network and engine keep {limits}; raise the budget, the best are: {front}")
     if budget.latency_ms is None and budget.error_n is None:
-        min_error_n = min(candidate.error_n for candidate in within)
-        most_accurate = (candidate for candidate in within if candidate.error_n == min_error_n)
-        fastest = min(most_accurate, key=lambda candidate: candidate.p50_ms)
-        return Choice(fastest, len(tested), "the fastest of the most accurate")
-    cheapest = min(within, key=lambda candidate: candidate.cost_ms)
-    return Choice(cheapest, len(tested), f"the cheapest that keeps {limits}")
+        chosen = min(within, key=lambda candidate: (candidate.error_n, candidate.p50_ms))
+        reason = "the fastest of the most accurate"
+    else:
+        chosen = min(within, key=lambda candidate: candidate.cost_ms)
+        reason = f"the cheapest that keeps {limits}"
+    return chosen, f"chose {chosen} ({reason} of {len(tested)} candidates)"
 
 
 def pareto_front(tested: Sequence[EngineCandidate]) -> list[EngineCandidate]:
