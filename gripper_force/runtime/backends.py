@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
-from gripper_force.config import CameraConfig, Config, LoadCellConfig
+from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Clock, Devices, SharedPort
 from gripper_force.plugins import load_class
@@ -34,6 +34,7 @@ LOAD_CELLS: Final = {
     "serial": "gripper_hw.load_cells.serial:SerialLoadCell",
     "phidget": "gripper_hw.load_cells.phidget:PhidgetLoadCell",
 }
+_SENSORS: Final = {"camera": CAMERAS, "load_cell": LOAD_CELLS}
 
 
 class MonotonicClock:
@@ -79,7 +80,7 @@ def with_camera_rate(config: Config) -> Config:
     """Sets ``camera.rate_hz`` to that of the log, if the camera plays one. Raises `GripperError` if it can't."""
     if config.camera.backend != "playback":
         return config
-    camera = load_class("cameras", CAMERAS, "playback", "camera.backend").resolve(config.camera)
+    camera = _sensor_class(config, "camera").resolve(config.camera)
     return config.with_values(camera=camera)
 
 
@@ -111,14 +112,12 @@ def check_devices(config: Config, port: SharedPort | None = None) -> None:
             raise ConfigError(
                 f"faults are for simulated devices only, but {key} is {value!r}; set {simulated}, or faults=[]"
             )
-    sensors = (("camera", CAMERAS, config.camera), ("load_cell", LOAD_CELLS, config.load_cell))
-    for unit, builtin, section in sensors:
-        if section.backend not in ("none", "simulated"):
-            backend = load_class(f"{unit}s", builtin, section.backend, f"{unit}.backend")
-            if config.clock == "lockstep" and not getattr(backend, "supports_lockstep", False):
-                raise ConfigError(
-                    f"{unit}.backend={section.backend} cannot follow simulated time; set clock=realtime"
-                )
+    for unit in _SENSORS:
+        name = getattr(config, unit).backend
+        if name not in ("none", "simulated"):
+            follows = getattr(_sensor_class(config, unit), "supports_lockstep", False)
+            if config.clock == "lockstep" and not follows:
+                raise ConfigError(f"{unit}.backend={name} cannot follow simulated time; set clock=realtime")
 
 
 @contextmanager
@@ -141,8 +140,8 @@ def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Dev
             rig = _rig_class()(config)
             stack.callback(rig.close)
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
-        camera = _open_sensor(stack, "camera", CAMERAS, config.camera, rig, clock)
-        load_cell = _open_sensor(stack, "load_cell", LOAD_CELLS, config.load_cell, rig, clock)
+        camera = _open_sensor(stack, "camera", config, rig, clock)
+        load_cell = _open_sensor(stack, "load_cell", config, rig, clock)
         shared = () if port is None else (port,)
         servo = load_servo_class(config)(config.servo, clock.now_ns, *shared)
         stack.callback(servo.close)
@@ -168,19 +167,15 @@ def _rig_class() -> Any:
     return load_class("rigs", {"virtual:rig": RIG}, "virtual:rig", "servo.port")
 
 
-def _open_sensor(
-    stack: ExitStack,
-    unit: str,
-    builtin: dict[str, str],
-    section: CameraConfig | LoadCellConfig,
-    rig: Any,
-    clock: Clock,
-) -> Any:
+def _sensor_class(config: Config, unit: str) -> Any:
+    return load_class(f"{unit}s", _SENSORS[unit], getattr(config, unit).backend, f"{unit}.backend")
+
+
+def _open_sensor(stack: ExitStack, unit: str, config: Config, rig: Any, clock: Clock) -> Any:
+    section = getattr(config, unit)
     if section.backend == "none":
         return None
-    if section.backend == "simulated":
-        device = getattr(rig, unit)
-    else:
-        device = load_class(f"{unit}s", builtin, section.backend, f"{unit}.backend")(section, clock)
+    simulated = section.backend == "simulated"
+    device = getattr(rig, unit) if simulated else _sensor_class(config, unit)(section, clock)
     stack.callback(device.close)
     return device
