@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.approach import Approach, ApproachState
-from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
+from gripper_force.control.force_loop import ForceLoop, tolerance_n
 from gripper_force.control.friction_allowance import FrictionAllowance
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
@@ -170,11 +170,6 @@ class GraspController:
         self._was_over_force = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
-
-    @property
-    def margins(self) -> dict[str, Margin]:
-        """Gains and phase margin of each control loop."""
-        return self._loop.margins
 
     def end_grasps(self) -> tuple[float, float] | None:
         """Ends the last grasp, and returns the ratio of all grasps (see `ObjectGain.ratio`); None without any."""

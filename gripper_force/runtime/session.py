@@ -222,7 +222,9 @@ class Session:
         visual = self._poll_perception()
         self._may_open = False  # if this cycle fails from here on, nothing is known of the servo
         state = self.servo_state = self._read_servo()
-        request = self._request(state.t_ns, kind, target_n, width_m, new_object)
+        request = None if kind is None else Request(state.t_ns, kind, target_n, width_m, new_object)
+        if self._stop_requested:
+            self._stop_requested, request = False, Request(state.t_ns, RequestKind.STOP)
         decision = self._controller.step(state.t_ns, state, visual, request)
         devices.servo.write(decision.command)
         self.cycles += 1
@@ -336,14 +338,6 @@ class Session:
     def _log(self, record: Record) -> None:
         if self._log_queue is not None:
             self._log_queue.write(record)
-
-    def _request(
-        self, t_ns: int, kind: RequestKind | None, target_n: float, width_m: float, new_object: bool
-    ) -> Request | None:
-        if self._stop_requested:
-            self._stop_requested = False
-            return Request(t_ns, RequestKind.STOP)
-        return None if kind is None else Request(t_ns, kind, target_n, width_m, new_object)
 
     def _log_sensors(self, t_ns: int, *, at_end: bool = False) -> None:
         devices = self._devices

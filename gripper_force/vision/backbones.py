@@ -109,9 +109,9 @@ class _Residual(nn.Module):
 class _InvertedResidual(nn.Module):
     """Inverted residual: 1x1 expansion, 3x3 depthwise convolution, 1x1 projection without ReLU."""
 
-    def __init__(self, inputs: int, outputs: int, stride: int, expansion: int = 4) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
-        inner = expansion * inputs
+        inner = 4 * inputs
         self.widen = _convolution(inputs, inner, 1)
         self.filter = _convolution(inner, inner, 3, stride, groups=inner)
         self.narrow = _convolution(inner, outputs, 1)

@@ -4,7 +4,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 from pydantic import Base64UrlBytes, Field, ValidationError, model_validator
 
@@ -102,8 +102,12 @@ class GaussianProcessConfig(Section):
         points: Number of training frames that it keeps.
         length: Length scale of its kernel, in standard deviations of the first component.
         label_scale_n: Scale of the forces, as of a network.
+        attention: No attention.
+        context: Number of earlier frames that an estimate depends on: none.
     """
 
+    attention: ClassVar[Attention] = "none"
+    context: ClassVar[int] = 0
     size: Annotated[int, Field(ge=16, le=1024)]
     grid: Annotated[int, Field(ge=1, le=128)]
     head: Count
@@ -116,16 +120,6 @@ class GaussianProcessConfig(Section):
         if self.size % self.grid:
             raise ValueError(f"size {self.size} is not a multiple of {self.grid}; use preprocess.size=64")
         return self
-
-    @property
-    def attention(self) -> Attention:
-        """No attention."""
-        return "none"
-
-    @property
-    def context(self) -> int:
-        """Number of earlier frames that an estimate depends on: none."""
-        return 0
 
 
 EXPORTED: Final = {".xml": "openvino", ".onnx": "onnxruntime"}

@@ -89,18 +89,17 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
 
 
 class Normaliser:
-    """Standardises the frames of a stream one by one and subtracts the stream's reference."""
+    """Standardises the frames of a stream one by one and subtracts the stream's reference.
+
+    Attributes:
+        reference_image: Mean of the reference frames, (S, S) uint8; None until it is complete or if none is used.
+    """
 
     def __init__(self, preprocess: Preprocess) -> None:
         self._preprocess = preprocess
         self._waiting: list[Gray] = []
         self._reference: npt.NDArray[np.float32] | None = None
-        self._reference_image: Gray | None = None
-
-    @property
-    def reference_image(self) -> Gray | None:
-        """Mean of the reference frames, (S, S) uint8; None until it is complete or if none is used."""
-        return self._reference_image
+        self.reference_image: Gray | None = None
 
     def push(self, small: Gray) -> list[npt.NDArray[np.float32]]:
         """Processes the next frame.
@@ -122,7 +121,7 @@ class Normaliser:
         waiting, self._waiting = self._waiting, []
         reference: npt.NDArray[np.float32] = np.mean([_standardise(image) for image in waiting], axis=0)
         self._reference = reference
-        self._reference_image = np.mean(waiting, axis=0).round().astype(np.uint8)
+        self.reference_image = np.mean(waiting, axis=0).round().astype(np.uint8)
         return [self._difference(image, reference) for image in waiting]
 
     def _difference(self, small: Gray, reference: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

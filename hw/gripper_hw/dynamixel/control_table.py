@@ -261,10 +261,7 @@ def _shared() -> Tree:
     return read_tree(_FOLDER / _SHARED)
 
 
-def _registers() -> dict[str, Register]:
-    rows = _shared()["registers"].items()
-    return {name: Register._make((*row[:6], row[6] and tuple(row[6]))) for name, row in rows}
-
-
-REGISTERS: Final = _registers()
+REGISTERS: Final = {
+    name: Register._make((*row[:6], row[6] and tuple(row[6]))) for name, row in _shared()["registers"].items()
+}
 """Registers by name, in order of address. Indirect addresses depend on the model: see `ServoModel`."""

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -122,7 +122,7 @@ class SampleValidator:
 
     def counts(self) -> dict[str, int]:
         """Counters by name (see `LoadCellStats`)."""
-        return {name: getattr(self.stats, name) for name in LoadCellStats.__slots__}
+        return asdict(self.stats)
 
     def _ready_count(self, now_ns: int) -> int:
         """Number of waiting samples that have enough followers, or waited `MAX_WAIT_NS` for them."""
@@ -142,17 +142,16 @@ class LiveLoadCell:
         config: The load cell section of the configuration.
         clock: The run's clock, which must be the host's.
         unit_n: Newtons per unit of the reading if ``load_cell.n_per_raw`` is not set; NaN if unknown.
+
+    Attributes:
+        stats: Counters of rejected samples and losses.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock, *, unit_n: float) -> None:
         self._config, self._clock = config, clock
         n_per_raw = unit_n if config.n_per_raw is None else config.n_per_raw
         self._validator = SampleValidator(config.tare_raw, n_per_raw)
-
-    @property
-    def stats(self) -> LoadCellStats:
-        """Counters of rejected samples and losses."""
-        return self._validator.stats
+        self.stats = self._validator.stats
 
     def drain(self) -> list[LoadCellSample]:
         """Returns the samples since the last call that can be checked by now, oldest first.
