@@ -161,7 +161,7 @@ NO_CODE = (
     tokenize.DEDENT,
     tokenize.ENDMARKER,
 )
-VIRTUAL = tuple(f"gripper_hw.dynamixel.{name}" for name in ("firmware", "memory_port", "virtual"))
+VIRTUAL = tuple(f"gripper_hw.dynamixel.{name}" for name in ("firmware", "memory_port", "packets", "virtual"))
 SIMULATED = ("gripper_hw.playback", "gripper_hw.sim", *VIRTUAL)
 """Simulated devices, which a program with a real gripper does not load. The driver reaches `VIRTUAL` by a port's name."""
 

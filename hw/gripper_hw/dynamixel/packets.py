@@ -1,6 +1,6 @@
-"""Protocol 2.0 packets: framing, CRC and byte stuffing (https://emanual.robotis.com/docs/en/dxl/protocol2/).
+"""Protocol 2.0 packets of the virtual bus: framing, CRC and byte stuffing. The driver uses the vendor's SDK instead.
 
-The virtual bus uses this module. The driver uses the vendor's SDK instead.
+See https://emanual.robotis.com/docs/en/dxl/protocol2/.
 """
 
 from collections.abc import Iterator
@@ -69,8 +69,9 @@ def _crc_table() -> tuple[int, ...]:
 _CRC_TABLE: Final = _crc_table()
 
 
-def crc16(data: bytes, crc: int = 0) -> int:
-    """CRC-16 with polynomial 0x8005, most significant bit first; ``crc`` continues an earlier one."""
+def crc16(data: bytes) -> int:
+    """CRC-16 with polynomial 0x8005, most significant bit first."""
+    crc = 0
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ byte]
     return crc

@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final, TypeVar
 
-from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS, PacketHandler
+from dynamixel_sdk import BROADCAST_ID, COMM_RX_CORRUPT, COMM_SUCCESS, PacketHandler
 from dynamixel_sdk.protocol2_packet_handler import (
+    ERRNUM_CRC,
     PKT_ERROR,
     PKT_ID,
     PKT_INSTRUCTION,
@@ -21,7 +22,6 @@ from gripper_force.config import ServoConfig
 from gripper_force.errors import DeviceError, DeviceTimeoutError
 from gripper_force.interfaces import BusStats, Lock, SharedPort
 from gripper_hw.dynamixel.control_table import REGISTERS
-from gripper_hw.dynamixel.packets import BROADCAST_ID, Error
 from gripper_hw.dynamixel.port import BorrowedPort, Port, open_port
 
 _READ_LENGTHS: Final = 8
@@ -32,6 +32,9 @@ _REPLY_TO_ALL: Final = 2
 """Status Return Level: a reply to every instruction."""
 
 _ERROR_MASK: Final = 0x7F  # bit 7 is the alert; the read block contains the full hardware error
+_ERRORS: Final = ("result fail", "instruction", "crc", "data range", "data length", "data limit", "access")
+"""Names of the error numbers, from 1 on."""
+
 _T = TypeVar("_T")
 
 
@@ -278,7 +281,7 @@ def _check_result(description: str, result: int, error: int) -> int:
     number = error & _ERROR_MASK
     if result != COMM_SUCCESS or number == 0:
         return result
-    if number == Error.CRC:
+    if number == ERRNUM_CRC:
         return int(COMM_RX_CORRUPT)  # the request was corrupted on the bus: retry
-    name = Error(number).name.lower().replace("_", " ") if number in list(Error) else "unknown"
+    name = _ERRORS[number - 1] if number <= len(_ERRORS) else "unknown"
     raise DeviceError(f"{description} was refused: error {number} ({name}); power-cycle the servo")

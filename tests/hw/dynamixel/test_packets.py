@@ -31,7 +31,6 @@ class Tap(dynamixel_sdk.PortHandler):  # type: ignore[misc]
 @given(contents)
 def test_crc_matches_the_sdk(data):
     assert crc16(data) == SDK.updateCRC(0, data, len(data))
-    assert crc16(data[2:], crc16(data[:2])) == crc16(data)
 
 
 @given(contents)
