@@ -1,12 +1,10 @@
 """Force loop: from a wanted contact force to a motor force."""
 
-from dataclasses import dataclass
-
 from gripper_force.config import ControlConfig
 from gripper_force.control.fusion import observer_lag_s
 from gripper_force.control.trajectory import TrapezoidalProfile
 from gripper_force.control.transmission import Transmission
-from gripper_force.control.tuning import Gains, Plant, phase_margin_deg, simc
+from gripper_force.control.tuning import Gains, Plant, simc
 from gripper_force.types import EstimateSource, FusedForce
 
 _RAMP_ACCELERATION_S = 0.4
@@ -53,12 +51,13 @@ def tolerance_n(target_n: float) -> float:
     return max(0.04 * target_n, 0.1)
 
 
-@dataclass(frozen=True, slots=True)
-class Margin:
-    """Gains of one loop and the resulting phase margin."""
-
-    gains: Gains
-    phase_margin_deg: float
+def loop_gains(config: ControlConfig, *, vision_alone: bool) -> Gains:
+    """Returns the gains of a hold with vision alone, or with the motor current too."""
+    gain, lag_s, delay_s = config.plant
+    # The current follows jaws that move at once. The force of stuck jaws is observed by vision alone,
+    # through the filter. For an integral controller the lags are additional delay.
+    stuck = Plant(gain, 0.0, delay_s + lag_s + observer_lag_s(config.frame_hz))
+    return simc(Plant(gain, lag_s, delay_s) if vision_alone else stuck)
 
 
 class ForceLoop:
@@ -84,17 +83,8 @@ class ForceLoop:
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
-        gain, lag_s, delay_s = config.plant
-        # The current follows jaws that move at once. The force of stuck jaws is observed by vision alone,
-        # through the filter. For an integral controller the lags are additional delay.
-        stuck = Plant(gain, 0.0, delay_s + lag_s + observer_lag_s(config.frame_hz))
-        plants = {"hold": stuck, "vision": Plant(gain, lag_s, delay_s)}
-        self.margins = {
-            name: Margin(gains := simc(plant), phase_margin_deg(plant, gains))
-            for name, plant in plants.items()
-        }
         self._vision_alone = config.feedback == "vision"
-        self._gains = self.margins["vision" if self._vision_alone else "hold"].gains
+        self._gains = loop_gains(config, vision_alone=self._vision_alone)
         self._transmission = transmission
         self._ramp_n_s = min(config.ramp_n_s, _MAX_RAMP_PER_S * config.force_limit_n)
         self._max_opening_m_s = config.approach_speed_m_s

@@ -17,11 +17,6 @@ class Plant:
     lag_s: float
     delay_s: float
 
-    def response(self, omega: float) -> complex:
-        """Returns the frequency response at ``omega`` in rad/s."""
-        s = 1j * omega
-        return self.gain * cmath.exp(-self.delay_s * s) / (self.lag_s * s + 1)
-
 
 @dataclass(frozen=True, slots=True)
 class Gains:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from gripper_calibration.fits.plant_fit import PressSeries, fit_plant
 from gripper_force.config import Config, ControlConfig
-from gripper_force.control.force_loop import ForceLoop
+from gripper_force.control.force_loop import ForceLoop, loop_gains
 from gripper_force.control.fusion import Fusion, observer_lag_s
 from gripper_force.control.limits import Limits
 from gripper_force.control.linkage import RackAndPinion
@@ -31,7 +31,6 @@ from gripper_force.qualification.loop_margin.analytic_plant import (
     POSITION_LOOP,
     Gripper,
     SimulatedVision,
-    transmission_of,
 )
 from gripper_force.types import NS_PER_S, EstimateSource, Phase, Request, RequestKind, ServoCommand
 
@@ -227,5 +226,4 @@ def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: f
 
 def gains_of(config: Config, feedback: str) -> Gains:
     """Returns the gains of the force loop."""
-    margins = ForceLoop(config.control, transmission_of(config.gripper)).margins
-    return margins["vision" if feedback == "vision" else "hold"].gains
+    return loop_gains(config.control, vision_alone=feedback == "vision")
