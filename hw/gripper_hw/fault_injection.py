@@ -58,12 +58,6 @@ class FaultyEstimator:
         self._estimator, self._faults, self._clock, self._lockstep = estimator, faults, clock, lockstep
         self._calls = 0
 
-    @property
-    def reference(self) -> Gray | None:
-        """Reference frame of the wrapped estimator."""
-        reference: Gray | None = self._estimator.reference
-        return reference
-
     def attention_map(self) -> Any:
         """Returns the attention map of the wrapped estimator."""
         return self._estimator.attention_map()

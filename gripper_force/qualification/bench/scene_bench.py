@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import GripperConfig
+from gripper_force.schema import to_yaml
 from gripper_force.types import NS_PER_MS, NS_PER_S
-from gripper_hw.sim.detail_level import write_table
+from gripper_hw.sim import detail_level
 from gripper_hw.sim.meshes import Detail
 from gripper_hw.sim.objects import OBJECTS
 from gripper_hw.sim.scene import Scene
@@ -30,6 +31,10 @@ _SAMPLE_NS: Final = 5 * NS_PER_MS
 
 _REPEATS: Final = 2
 """Runs of each scene; the faster one counts."""
+
+_TABLE_HEADER: Final = (
+    "# Made by `gripper-force bench scene --write docs/simulation.md`. Do not edit by hand.\n"
+)
 
 Curve = npt.NDArray[np.float64]
 
@@ -117,7 +122,7 @@ def scene_costs(names: list[str], keep_table: bool) -> Iterator[SceneCost]:
             }
             yield row
     if keep_table:
-        write_table(table)
+        detail_level.TABLE.write_text(_TABLE_HEADER + to_yaml(table), encoding="utf-8")
 
 
 def _squeeze(name: str, detail: Detail) -> _Squeeze:

@@ -9,32 +9,25 @@ from typing import Final
 
 from gripper_force.config import BudgetConfig, Config
 from gripper_force.errors import ConfigError
-from gripper_force.schema import read_tree, to_yaml
+from gripper_force.schema import read_tree
 
-_TABLE: Final = Path(__file__).with_name("detail_level.yaml")
-_HEADER: Final = "# Made by `gripper-force bench scene --write docs/simulation.md`. Do not edit by hand.\n"
+TABLE: Final = Path(__file__).with_name("detail_level.yaml")
+"""Levels by name of an object."""
 
 Levels = dict[str, dict[str, float]]
 """Level of detail to its ``error_n`` (N) and ``speed`` (simulated s/s), as measured by `bench scene`."""
-
-
-def write_table(table: dict[str, Levels]) -> None:
-    """Writes the shipped table; its keys are names of objects."""
-    _TABLE.write_text(_HEADER + to_yaml(table), encoding="utf-8")
 
 
 def resolve_detail(config: Config) -> tuple[Config, str]:
     """Replaces ``sim.detail: auto`` by a level.
 
     Returns:
-        The configuration with a level, and the reason for the choice; an empty reason if it was not ``auto``.
+        The configuration with a level, and the reason for the choice.
 
     Raises:
         ConfigError: The table lacks the object, no budget is set, or no level meets it.
     """
-    if config.sim.detail != "auto":
-        return config, ""
-    table: dict[str, Levels] = read_tree(_TABLE)
+    table: dict[str, Levels] = read_tree(TABLE)
     if config.object not in table:
         raise ConfigError(
             f"sim.detail=auto has no data of {config.object!r}, only of {', '.join(table)}; "

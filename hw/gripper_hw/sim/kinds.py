@@ -17,6 +17,7 @@ from gripper_force.schema import Positive, Section, Tree, tree_from, validated
 from gripper_hw.sim.mesh_files import MAX_SIZE_M, MIN_SIZE_M, MeshFile, read_image, read_mesh
 from gripper_hw.sim.meshes import (
     SHELL_CONTACT,
+    SHELL_MESHES,
     SOFT_CONTACT,
     Detail,
     Indices,
@@ -228,9 +229,7 @@ class Shell(ObjectKind):
     def build(self, detail: Detail, size: float, stiffness: float) -> ObjectModel:
         """Builds a shell."""
         lengths = np.array(self.size_m) * size
-        around, along, dt = {"coarse": (12, 6, 0.0025), "medium": (16, 8, 0.0025), "fine": (32, 16, 0.00125)}[
-            detail
-        ]
+        around, along, dt = SHELL_MESHES[detail]
         length = lengths[1] if self.lying else lengths[2]
         points, uv, faces = shell_of_revolution(
             1.0,

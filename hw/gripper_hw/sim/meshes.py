@@ -15,6 +15,14 @@ SOFT_CONTACT = 'solref=".01 1" solimp=".9 .95 .001"'
 SHELL_CONTACT = 'solref=".005 1" solimp=".95 .99 .001"'
 
 
+SHELL_MESHES: dict[Detail, tuple[int, int, float]] = {
+    "coarse": (12, 6, 0.0025),
+    "medium": (16, 8, 0.0025),
+    "fine": (32, 16, 0.00125),
+}
+"""Points of a shell around and along its axis, and time step in s."""
+
+
 @dataclass(frozen=True)
 class ObjectModel:
     """One object between the jaws.

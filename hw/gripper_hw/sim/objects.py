@@ -14,6 +14,7 @@ from gripper_force.errors import ConfigError
 from gripper_hw.sim.kinds import load_kinds
 from gripper_hw.sim.meshes import (
     SHELL_CONTACT,
+    SHELL_MESHES,
     SOFT_CONTACT,
     Detail,
     ObjectModel,
@@ -106,11 +107,9 @@ def _sponge(detail: Detail, size: float, stiffness: float) -> ObjectModel:
 
 
 def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
-    around, along, dt = {"coarse": (12, 5, 0.0025), "medium": (16, 7, 0.0025), "fine": (32, 15, 0.00125)}[
-        detail
-    ]
+    around, along, dt = SHELL_MESHES[detail]
     radius, length = 0.022 * size, 0.05 * size
-    points, uv, faces = shell_of_revolution(radius, radius, length, around, along, seam_rad=-np.pi / 2)
+    points, uv, faces = shell_of_revolution(radius, radius, length, around, along - 1, seam_rad=-np.pi / 2)
     points = points[:, [0, 2, 1]] - [0, length / 2, 0]  # axis along y, so that the camera sees both ends
     points[:, 2] += radius + 0.0012
     # Pins a strip: a single pinned line would act as a hinge.
@@ -122,9 +121,7 @@ def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
 
 
 def _cup(detail: Detail, size: float, stiffness: float) -> ObjectModel:
-    around, along, dt = {"coarse": (12, 6, 0.0025), "medium": (16, 8, 0.0025), "fine": (32, 16, 0.00125)}[
-        detail
-    ]
+    around, along, dt = SHELL_MESHES[detail]
     points, uv, faces = shell_of_revolution(
         0.026 * size, 0.037 * size, 0.085 * size, around, along, seam_rad=np.pi / 2, bottom=True
     )

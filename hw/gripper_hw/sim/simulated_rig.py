@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
@@ -78,25 +79,40 @@ class LockstepClock:
         self._world.advance_to(self._now_ns)
 
 
-class SimulatedCamera:
+class _SimulatedSensor(ABC):
+    """A sensor that the world calls in each of its periods, from its start until it is closed."""
+
+    def __init__(self, world: World, rate_hz: float) -> None:
+        self._world, self._period_ns = world, round(NS_PER_S / rate_hz)
+        self._started = self._closed = False
+
+    def start(self) -> None:
+        """Starts capturing or sampling."""
+        if not self._started:
+            self._started = True
+            self._world.call_every(self._period_ns, self._sense)
+
+    def counts(self) -> dict[str, int]:
+        """Returns an empty mapping: without injected faults nothing is lost or rejected."""
+        return {}
+
+    @abstractmethod
+    def _sense(self, t_ns: int) -> None:
+        """Takes a frame or sample."""
+
+
+class SimulatedCamera(_SimulatedSensor):
     """Renders the world at the middle of each exposure; a frame is available after the camera's latency."""
 
     def __init__(self, world: World, scene: Scene, config: Config, clock: Clock, start_ns: int) -> None:
-        self._world, self._scene, self._clock, self._start_ns = world, scene, clock, start_ns
+        super().__init__(world, config.camera.rate_hz)
+        self._scene, self._clock, self._start_ns = scene, clock, start_ns
         self._surroundings = Surroundings(scene)
         self._latency_ns = round(config.sim.camera_latency_ms * NS_PER_MS)
-        self._period_ns = round(NS_PER_S / config.camera.rate_hz)
         self._exposure = _relative_exposure(config)
         self._rng = np.random.default_rng([config.seed, 2])
         self._pending: deque[Frame] = deque(maxlen=_MAX_UNREAD_FRAMES + self._latency_ns // self._period_ns)
         self._seq = 0
-        self._started = self._closed = False
-
-    def start(self) -> None:
-        """Starts capturing."""
-        if not self._started:
-            self._started = True
-            self._world.call_every(self._period_ns, self._capture)
 
     def newest(self) -> Frame | None:
         """Returns the newest available frame that was not returned yet, or None."""
@@ -105,16 +121,12 @@ class SimulatedCamera:
             frame = self._pending.popleft()
         return frame
 
-    def counts(self) -> dict[str, int]:
-        """Returns an empty mapping: without injected faults nothing is lost or rejected."""
-        return {}
-
     def close(self) -> None:
         """Stops capturing. May be called twice. The world frees the rendering context."""
         self._closed = True
         self._pending.clear()
 
-    def _capture(self, t_ns: int) -> None:
+    def _sense(self, t_ns: int) -> None:
         if self._closed:
             return
         scene, image = self._scene, self._world.render(_SUPERSAMPLING * FRAME_SIDE_PX)
@@ -125,38 +137,27 @@ class SimulatedCamera:
         self._seq += 1
 
 
-class SimulatedLoadCell:
+class SimulatedLoadCell(_SimulatedSensor):
     """Simulated load cell: mean force on the two pads, with white noise."""
 
     _NOISE_N = 0.01  # standard deviation
 
     def __init__(self, world: World, config: Config, start_ns: int) -> None:
-        self._world, self._start_ns = world, start_ns
-        self._period_ns = round(NS_PER_S / config.load_cell.rate_hz)
+        super().__init__(world, config.load_cell.rate_hz)
+        self._start_ns = start_ns
         self._rng = np.random.default_rng([config.seed, 3])
         self._samples: deque[LoadCellSample] = deque(maxlen=_MAX_UNREAD_SAMPLES)
-        self._started = self._closed = False
-
-    def start(self) -> None:
-        """Starts sampling."""
-        if not self._started:
-            self._started = True
-            self._world.call_every(self._period_ns, self._sample)
 
     def drain(self) -> list[LoadCellSample]:
         """Returns all samples since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
-
-    def counts(self) -> dict[str, int]:
-        """Returns an empty mapping: without injected faults nothing is lost or rejected."""
-        return {}
 
     def close(self) -> None:
         """Stops sampling. May be called twice."""
         self._closed = True
         self._samples.clear()
 
-    def _sample(self, t_ns: int) -> None:
+    def _sense(self, t_ns: int) -> None:
         if self._closed:
             return
         force_n = self._world.force_n + float(self._rng.normal(0.0, self._NOISE_N))
@@ -265,18 +266,7 @@ class SimulatedRig:
         self._stop, self._is_prepared = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
 
-    @staticmethod
-    def resolve(config: Config) -> tuple[Config, str]:
-        """Replaces ``sim.detail: auto`` by a level of detail.
-
-        Returns:
-            The configuration with a level, and the reason for the choice; an empty reason if it was not
-            ``auto``.
-
-        Raises:
-            ConfigError: The object has no measured levels, no budget is set, or no level meets it.
-        """
-        return resolve_detail(config)
+    resolve = staticmethod(resolve_detail)
 
     def _wrap_in_faults(self, faults: Faults, seed: int) -> None:
         def remove_object(t_ns: int) -> None:

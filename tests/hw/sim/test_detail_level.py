@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from gripper_force.config import BudgetConfig, load_config
 from gripper_force.errors import ConfigError
+from gripper_force.runtime.backends import resolve_simulation
 from gripper_hw.sim import detail_level as detail
 from gripper_hw.sim.detail_level import resolve_detail, select_level
 from gripper_hw.sim.meshes import Detail
@@ -54,7 +55,7 @@ def test_shipped_table_has_every_object(name: str) -> None:
 
 def test_configured_level_is_kept() -> None:
     config = load_config(None, ["budget.sim_speed=1e6"])
-    assert resolve_detail(config) == (config, "")
+    assert resolve_simulation(config) == (config, "")
 
 
 @pytest.mark.parametrize(
@@ -93,4 +94,4 @@ def test_rig_resolves_level(quick: list[str]) -> None:
     resolved, reason = SimulatedRig.resolve(config)
     assert resolved.sim.detail == "medium"
     assert reason.startswith("chose sim.detail=medium ")
-    assert SimulatedRig.resolve(resolved) == (resolved, "")
+    assert resolve_simulation(resolved) == (resolved, "")

@@ -48,7 +48,7 @@ def test_write_needs_all_objects(tmp_path: Path) -> None:
 
 
 def test_finer_levels_cost_more_and_have_less_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(detail, "_TABLE", tmp_path / "detail.yaml")
+    monkeypatch.setattr(detail, "TABLE", tmp_path / "detail.yaml")
     coarse, medium, fine = scene_costs(["stapler"], keep_table=True)
     assert [row.detail for row in (coarse, medium, fine)] == ["coarse", "medium", "fine"]
     assert coarse.step_ms > medium.step_ms > fine.step_ms > 0
