@@ -75,6 +75,8 @@ class Session:
 
     Attributes:
         resolved: The resolved configuration.
+        opening_s: Longest time in which the jaws open.
+        timeout_s: Returns the time after which a grasp with a target force has timed out.
         has_vision: True once there was a visual estimate.
         failed: True if the run is at fault, so that it ends as ``control.on_fault`` says.
         reason: Newest reason of a change of phase or outcome.
@@ -96,6 +98,7 @@ class Session:
     ) -> None:
         self.resolved, self._devices = resolved, devices
         self._controller, self._perception, self._log_queue = controller, perception, log_queue
+        self.opening_s, self.timeout_s = controller.opening_s, controller.timeout_s
         self._period_ns = round(NS_PER_S / resolved.config.control.rate_hz)
         self._due_ns = 0
         self._stop_requested = False
@@ -113,15 +116,6 @@ class Session:
         self.newest_frame: Frame | None = None
         self.servo_state: ServoState | None = None
         self.last_load_cell_sample: LoadCellSample | None = None
-
-    def timeout_s(self, target_n: float) -> float:
-        """Returns the time after which a grasp with a target force has timed out."""
-        return self._controller.timeout_s(target_n)
-
-    @property
-    def opening_s(self) -> float:
-        """Longest time in which the jaws open."""
-        return self._controller.opening_s
 
     @property
     def lost_records(self) -> int:

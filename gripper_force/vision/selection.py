@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
 
 from gripper_force.config import BudgetConfig, VisionConfig
 from gripper_force.errors import ConfigError
@@ -97,11 +96,10 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Engin
     """
     known = read_cache()
     found = []
-    for setting in _settings(vision, set_threads):
-        key = cache_key(*setting)
-        error_n = setting.model.header.metrics.get("mae_n", float("inf"))
+    for model, engine, precision, threads in _settings(vision, set_threads):
+        key = cache_key(model, engine, precision, threads)
+        error_n = model.header.metrics.get("mae_n", float("inf"))
         if key not in known:
-            model, engine, precision, threads = setting
             keeps_threads = engine == "torch" and not set_threads
             with _restored_threads(engine):
                 opened = open_engine(model, engine, precision, None if keeps_threads else threads)
@@ -110,7 +108,7 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Engin
             if engine_version(engine):  # without a version, a measurement could outlive an update
                 update_cache({key: known[key]})
         # The file and its stated error can change without the digest, so they are not taken from the cache.
-        found.append(replace(known[key], checkpoint=_name(setting.model), error_n=error_n))
+        found.append(replace(known[key], checkpoint=_name(model), error_n=error_n))
     return found
 
 
@@ -119,14 +117,8 @@ def installed() -> list[str]:
     return [engine for engine in ENGINES if engine_version(engine)]
 
 
-class _Setting(NamedTuple):
-    model: Model
-    engine: str
-    precision: Precision
-    threads: int
-
-
-def _settings(vision: VisionConfig, set_threads: bool) -> Iterator[_Setting]:
+def _settings(vision: VisionConfig, set_threads: bool) -> Iterator[tuple[Model, str, Precision, int]]:
+    """Yields network, engine, precision and number of threads of each candidate."""
     sources = list(SHIPPED) if vision.checkpoint == "auto" else [vision.checkpoint]
     cores = os.cpu_count() or 1
     for source in sources:
@@ -136,19 +128,13 @@ def _settings(vision: VisionConfig, set_threads: bool) -> Iterator[_Setting]:
                 continue
             threads = [t for t in (1, 2, 4, 8) if t <= cores] if vision.engine == "auto" else [vision.threads]
             if engine == "torch" and not set_threads:
-                threads = [_own_threads()]
+                with importing("vision.engine=torch"):
+                    import torch
+                threads = [torch.get_num_threads()]
             if vision.precision != "float32" and engine in ENGINES and engine != "openvino":
                 continue
             for count in threads:
-                yield _Setting(model, engine, vision.precision, count)
-
-
-def _own_threads() -> int:
-    """Returns PyTorch's present thread count."""
-    with importing("vision.engine=torch"):
-        import torch
-
-    return torch.get_num_threads()
+                yield model, engine, vision.precision, count
 
 
 def _restored_threads(engine: str) -> AbstractContextManager[object]:

@@ -167,7 +167,7 @@ def test_precision_is_never_chosen_because_only_float32_has_the_score_of_unfamil
     monkeypatch.setattr(selection, "SHIPPED", {"default": SHIPPED["default"]})
 
     def precisions(vision: VisionConfig) -> set[str]:
-        return {setting.precision for setting in selection._settings(vision, set_threads=True)}
+        return {precision for _, _, precision, _ in selection._settings(vision, set_threads=True)}
 
     assert precisions(AUTO) == {"float32"}
     assert precisions(VisionConfig(engine="auto", precision="bfloat16")) == {"bfloat16"}
