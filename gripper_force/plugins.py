@@ -18,9 +18,11 @@ _METHODS: Final = {
     "load_cells": {"drain": "list tuple", "start": "object", "counts": "dict", "close": "object"},
     "engines": {"step": "StepOutput", "warm_up": "object", "reset": "object"},
 }
-"""Methods of each interface, which a class, or what a function makes, is checked for before one is called, and names of
-the types that they may return; names, because importing the types takes time. A wrong type is reported here, where the
-class is known."""
+"""Methods of each interface, each with the names of the types that it may return.
+
+A class, or the object that a function returns, is checked for the methods before it is used. A wrong type is reported
+here, where the class is known. They are names, because importing the types takes time.
+"""
 
 EXTRAS: Final = {
     **dict.fromkeys(("torch", "onnx", "onnxscript"), "train"),
@@ -70,8 +72,8 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
         alternative: Another remedy if a package is not installed; see `importing`.
 
     Returns:
-        The class. One that is not built in is wrapped, and so are its objects: what their methods raise, or return
-        by mistake, becomes one sentence, a `DeviceError`, or a `ConfigError` of an engine.
+        The class. A class that is not built in is wrapped, and so are its objects: if a method raises, or returns a
+        wrong type, the error is a `DeviceError` of one sentence, for an engine a `ConfigError`.
 
     Raises:
         ConfigError: The name is unknown, its module or a package that it needs is not installed, or what it

@@ -66,9 +66,9 @@ _SCALARS = {
 }
 """Patterns of values without quotes that are no text, by tag.
 
-They are what YAML 1.1, as PyYAML writes it without quotes, and YAML 1.2's core schema
-(https://yaml.org/spec/1.2.2/#103-core-schema) both read so, and 010, which is 10. Others, such as 1e-3 and 08, are
-text, and numbers of a key that wants one.
+YAML 1.1, as PyYAML writes it without quotes, and the core schema of YAML 1.2
+(https://yaml.org/spec/1.2.2/#103-core-schema) agree on these values. The only exception is 010, which is 10 here. Other
+values, such as 1e-3 and 08, are text; a key that needs a number converts them.
 """
 
 

@@ -61,7 +61,7 @@ def read_profiles(config: Config) -> Profiles:
 
 
 def with_bundle(config: Config) -> tuple[Config, str]:
-    """Names a bundle's profile and network in a configuration that leaves the network open, and returns a note too."""
+    """Returns the configuration with a bundle's profile and network, unless it names a network, and a note about it."""
     name = config.profile
     if config.calibration.object is None and (user_folder() / config.object / BUNDLED).is_file():
         name = config.object

@@ -42,11 +42,11 @@ class LogQueue:
 
     def write(self, record: Record) -> None:
         """Writes a record, now or soon."""
-        self._do(lambda: self._log.write(record))
+        self._submit(lambda: self._log.write(record))
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Adds a file to the log, now or soon."""
-        self._do(lambda: self._log.attach(name, data, media_type))
+        self._submit(lambda: self._log.attach(name, data, media_type))
 
     def close(self) -> None:
         """Writes the waiting records and completes the log. May be called twice."""
@@ -59,7 +59,7 @@ class LogQueue:
                 self._error = f"the disk did not take the last records within {_TIMEOUT_S:g} s"
                 return  # the log is still the thread's
             self._thread = None
-        self._count(self._log.close)
+        self._run_write(self._log.close)
 
     def raise_losses(self) -> None:
         """Reports lost records after the run, because they must not end it.
@@ -72,9 +72,9 @@ class LogQueue:
                 f"{self._error}; the run went on, and its log lacks {self.lost} records: {self._remedy}"
             )
 
-    def _do(self, write: Callable[[], None]) -> None:
+    def _submit(self, write: Callable[[], None]) -> None:
         if self._thread is None:
-            self._count(write)
+            self._run_write(write)
             return
         try:
             self._queue.put_nowait(write)
@@ -84,9 +84,9 @@ class LogQueue:
 
     def _run(self) -> None:
         while (write := self._queue.get()) is not None:
-            self._count(write)
+            self._run_write(write)
 
-    def _count(self, write: Callable[[], None]) -> None:
+    def _run_write(self, write: Callable[[], None]) -> None:
         try:
             write()
         # If the thread ended here, all later records would be lost without a message.

@@ -74,7 +74,7 @@ def exported_file(model: Model, suffix: str) -> Path:
         return shipped
     path = cache_folder() / name
     if not path.exists():
-        # No part of what a robot runs.
+        # Imported by name: the export is not among the modules that a run with a robot reaches.
         import_module("gripper_force.vision.export_process").export_apart(model, path)
     return path
 

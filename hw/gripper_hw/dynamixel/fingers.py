@@ -50,7 +50,7 @@ class FingerPair:
         self._a_per_rad = model.position_loop_per_rad * model.stall_current_a
         self._states: tuple[ServoState, ServoState] | None = None
         self._kept_half_rad = 0.0  # half of the distance that the fingers keep
-        self._way, self._furthest_rad = 0.0, 0.0  # direction of the lead, and how far the mean has come
+        self._direction, self._furthest_rad = 0.0, 0.0  # direction of the lead, and how far the mean has come
         self._goals_a = [0.0, 0.0]
 
     def range_rad(self, low_rad: float, high_rad: float) -> tuple[float, float]:
@@ -80,7 +80,7 @@ class FingerPair:
         if problem := self.start_problem(first_rad, second_rad):
             raise DeviceError(problem)
         self._kept_half_rad = self.difference_rad(first_rad, second_rad) / 2
-        self._way, self._goals_a = 0.0, [0.0, 0.0]
+        self._direction, self._goals_a = 0.0, [0.0, 0.0]
 
     def combine(self, states: Sequence[ServoState]) -> ServoState:
         """Returns the common state. Raises `HardwareFaultError` if the fingers differ too much."""
@@ -122,8 +122,8 @@ class FingerPair:
         mean_rad = (first.position_rad + second.position_rad) / 2
         half_rad = (second.position_rad - first.position_rad) / 2
         lead_rad, goal_a = command.goal_position_rad - mean_rad, command.goal_current_a
-        way = math.copysign(1.0, lead_rad)
-        self._follow(way, mean_rad, half_rad)
+        direction = math.copysign(1.0, lead_rad)
+        self._follow(direction, mean_rad, half_rad)
         static_rad = _STATIC_SPARE * abs(goal_a) / self._a_per_rad
         max_rad = max(abs(lead_rad), static_rad)
         shift_rad = self._kept_half_rad - half_rad
@@ -131,9 +131,9 @@ class FingerPair:
             min(max(lead, -max_rad), max_rad) for lead in (lead_rad - shift_rad, lead_rad + shift_rad)
         ]
         self._goals_a = [goal_a, goal_a]
-        slowest_rad_s, fastest_rad_s = sorted(way * state.velocity_rad_s for state in self._states)
+        slowest_rad_s, fastest_rad_s = sorted(direction * state.velocity_rad_s for state in self._states)
         if slowest_rad_s > -_STANDING_RAD_S and fastest_rad_s > _STANDING_RAD_S:
-            ahead = int(way * half_rad > 0)
+            ahead = int(direction * half_rad > 0)
             min_share = _MIN_SHARE if slowest_rad_s < _STANDING_RAD_S else _MIN_MOVING_SHARE
             share = 1 - abs(half_rad) / _EQUALISING_RAD
             shorter_rad = max(max(share, min_share) * abs(lead_rad), static_rad)
@@ -151,13 +151,13 @@ class FingerPair:
             for goal_rad, goal_a in zip(goals_rad, self._goals_a, strict=True)
         )
 
-    def _follow(self, way: float, mean_rad: float, half_rad: float) -> None:
+    def _follow(self, direction: float, mean_rad: float, half_rad: float) -> None:
         """Lets the kept distance follow the present one, as far as the mean makes headway.
 
         A finger that moves alone moves the mean. A push at the object moves the fingers by as much to either side.
         """
-        if way != self._way:
-            self._way, self._furthest_rad = way, way * mean_rad
-        headway_rad = max(way * mean_rad - self._furthest_rad, 0.0)
+        if direction != self._direction:
+            self._direction, self._furthest_rad = direction, direction * mean_rad
+        headway_rad = max(direction * mean_rad - self._furthest_rad, 0.0)
         self._furthest_rad += headway_rad
         self._kept_half_rad += min(max(half_rad - self._kept_half_rad, -headway_rad), headway_rad)

@@ -48,7 +48,7 @@ class PhidgetLoadCell(LiveLoadCell):
                 f"set it to {MIN_RATE_HZ} to {MAX_RATE_HZ} samples/s"
             )
         self._channel: Any = None
-        self._is_told = False  # an error has told that the next ratio is beyond the range
+        self._was_reported = False  # an error has reported that the next ratio is beyond the range
 
     def start(self) -> None:
         """Opens the bridge's input and starts sampling.
@@ -96,14 +96,14 @@ class PhidgetLoadCell(LiveLoadCell):
 
     def _sampled(self, _channel: Any, ratio: float) -> None:
         saturated = not abs(ratio) <= _MAX_RATIO
-        if not (saturated and self._is_told):
+        if not (saturated and self._was_reported):
             self._add(ratio, saturated)
-        self._is_told = False
+        self._was_reported = False
 
     def _failed(self, _channel: Any, code: int, _text: str) -> None:
         if code in _OUT_OF_RANGE:
             self._add(math.nan, saturated=True)
-            self._is_told = True
+            self._was_reported = True
 
     def _detached(self, _channel: Any) -> None:
         self.stats.losses += 1
