@@ -430,7 +430,8 @@ class GraspController:
     def _objection(self) -> str:
         """Observation of the camera that speaks against a grip; empty without one."""
         current_n = self._motor_force_n - self._estimate.friction_n
-        return self._visual_check.objection(self._derated_target_n, current_n)
+        is_held = self._outcome == Outcome.HELD
+        return self._visual_check.objection(self._derated_target_n, current_n, is_held=is_held)
 
     @property
     def _tolerance_n(self) -> float:

@@ -9,6 +9,10 @@ _FILTER_S = 0.1
 _RISE_SHARE = 0.15
 """The filtered visual estimate must have risen by at least this share of the target since the jaws stopped."""
 
+_NOISE_SHARE = 0.25
+"""Until the grip counts as held, it must also have risen by its standard deviation, up to this share of the target:
+noise alone reaches the share of a small target. Unfamiliar frames have no standard deviation."""
+
 _BEYOND_SHARE = 1.0
 _BEYOND_N = 1.5
 """Excess of the visual estimate over the target, the larger of the two, that no object explains."""
@@ -31,6 +35,7 @@ class VisualCheck:
     def __init__(self, config: ControlConfig) -> None:
         self._config = config
         self._force_n: float | None = None
+        self._std_n = 0.0
         self._t_ns, self._before_n = 0, 0.0
         self._covered_ns: int | None = None
         self._has_seen = self._has_unsure = False
@@ -78,9 +83,10 @@ class VisualCheck:
         dt_s = (visual.t_ns - self._t_ns) / NS_PER_S
         before_n = visual.force_n if self._force_n is None else self._force_n
         self._force_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _FILTER_S)
+        self._std_n = visual.std_n if visual.is_familiar else 0.0
         self._t_ns = visual.t_ns
 
-    def objection(self, target_n: float, current_n: float) -> str:
+    def objection(self, target_n: float, current_n: float, *, is_held: bool = False) -> str:
         """Returns the observation that speaks against a grip, or an empty text.
 
         It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
@@ -90,6 +96,7 @@ class VisualCheck:
         Args:
             target_n: Target force.
             current_n: Motor force beyond friction.
+            is_held: True if the grip counts as held. It then takes less to confirm it, so that noise does not end it.
         """
         by_friction = current_n < _PROVEN_SHARE * target_n
         if by_friction and self._covered_ns is not None:
@@ -97,7 +104,8 @@ class VisualCheck:
         if self._force_n is None:
             return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
-        has_risen = self._force_n - self._before_n >= _RISE_SHARE * target_n
+        noise_n = 0.0 if is_held else min(self._std_n, _NOISE_SHARE * target_n)
+        has_risen = self._force_n - self._before_n >= _RISE_SHARE * target_n + noise_n
         if has_risen and not (by_friction and self._force_n - target_n > beyond_n):
             return ""
         return f"the camera sees {self._force_n:.1f} N, and saw {self._before_n:.1f} N before the contact"

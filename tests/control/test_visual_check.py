@@ -39,6 +39,21 @@ def test_a_force_that_does_not_rise_is_an_objection(before_n, std_n):
     assert f"saw {before_n:.1f} N before the contact" in check.objection(4.0, 4.0)
 
 
+@pytest.mark.parametrize(
+    ("rise_n", "target_n", "std_n", "objects"),
+    [
+        (0.3, 1.0, 0.2, True),
+        (0.4, 1.0, 0.2, False),
+        (0.2, 0.4, 0.4, False),  # a small target may be within the noise
+        (0.3, 1.0, math.inf, False),  # the noise of unfamiliar frames is not known
+    ],
+)
+def test_a_rise_within_the_noise_confirms_only_a_grip_that_was_held(rise_n, target_n, std_n, objects):
+    check, _ = seen(3.0 + rise_n, before_n=3.0, std_n=std_n)
+    assert bool(check.objection(target_n, 4.0)) == objects
+    assert not check.objection(target_n, 4.0, is_held=True)
+
+
 def test_far_more_than_the_target_is_an_objection_unless_the_motor_current_proves_a_grip():
     check, _ = seen(9.0)
     assert "sees 8.9 N" in check.objection(4.0, 1.9)
