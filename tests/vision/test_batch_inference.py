@@ -1,3 +1,6 @@
+import weakref
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -39,3 +42,25 @@ def test_last_layers_map_features_to_forces() -> None:
         parts = torch.from_numpy(features).split([7, 5], dim=1)
         again = torch.stack([network.force_n(part) for network, part in zip(networks, parts, strict=True)])
     np.testing.assert_allclose(forces, again, rtol=1e-6)
+
+
+def test_no_batch_of_a_long_recording_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch's memory, which `tracemalloc` does not count."""
+    made: list[weakref.ref[torch.Tensor]] = []
+
+    def normalise(*arguments: Any) -> torch.Tensor:
+        made.append(weakref.ref(batch := original(*arguments)))
+        return batch
+
+    original = batch_inference.normalise
+    monkeypatch.setattr(batch_inference, "normalise", normalise)
+    monkeypatch.setitem(batch_inference.BATCH, "cpu", 4)
+    monkeypatch.setattr(batch_inference, "CHUNK", 8)
+    network = ForceNetwork(NetworkConfig(size=16, width=0.25, hidden=6, head=7)).eval()
+    frames = np.random.default_rng(0).integers(0, 256, (40, 16, 16), np.uint8)
+    alive = [
+        sum(batch() is not None for batch in made)
+        for _ in batch_inference.stream_features([network], Preprocess(size=16), frames)
+    ]
+    assert len(made) == 10
+    assert alive == [1] * 5  # the last one, which the loop still names
