@@ -113,6 +113,14 @@ def test_bundle_holds_network_profile_and_origin(taught: Taught, logs: list[Path
     assert profile.checkpoint == resolve(load_config(None, ["object=disc"])).model.digest  # type: ignore[union-attr]
 
 
+def test_a_real_camera_may_have_a_region(
+    taught: Taught, config: Config, logs: list[Path], work: Path, tmp_path: Path
+) -> None:
+    real = config.with_values(clock="realtime", vision={"region": (40, 40, 400, 400)})
+    result = teach(real, "disc", logs=logs, folder=work, out=tmp_path / "disc")
+    assert result.learned == taught.learned
+
+
 def test_best_candidate_is_taken_and_its_error_is_that_on_new_touches(
     taught: Taught, press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
 ) -> None:
