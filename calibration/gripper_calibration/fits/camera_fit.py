@@ -109,7 +109,7 @@ def select_exposure(candidates: Sequence[ExposureCandidate]) -> ExposureCandidat
 
 
 def nearest_exposure(candidates: Sequence[ExposureCandidate]) -> ExposureCandidate:
-    """Returns the candidate with the best mean gray value, a usable one if there is one."""
+    """Returns the usable candidate with the best mean gray value; of all candidates if none is usable."""
     return min(candidates, key=lambda one: (not one.usable, abs(np.log(max(one.mean, 1.0) / _BEST_MEAN))))
 
 

@@ -134,7 +134,7 @@ def _sum_n(estimates_n: Sequence[Floats], parts: Sequence[Measured]) -> float:
 def estimate_left_out(
     estimates_n: Mapping[tuple[int, int], Floats], parts: Sequence[Measured], coverage: float
 ) -> tuple[list[Floats], list[npt.NDArray[np.bool_]]]:
-    """Estimates each part by the candidate that the other parts select, and tests an interval of theirs on it.
+    """Estimates each part by the candidate that the other parts select, and tests their interval on this part.
 
     Args:
         estimates_n: Estimates of all candidates for part i by fits without the parts i and j, by (i, j), and by fits

@@ -200,7 +200,7 @@ def calibrate_camera(
 
 
 def _outdated(before: Config, after: Config) -> tuple[str, ...]:
-    """Names what was made with the camera settings of one configuration, and not with those of the other."""
+    """Names the profiles and the network that match the camera settings of ``before``, but not those of ``after``."""
     made: list[tuple[str, Callable[[Tree], list[str]]]] = []
     for path in sorted([*user_folder().glob("*.yaml"), *user_folder().glob(f"*/{BUNDLED}")]):
         try:

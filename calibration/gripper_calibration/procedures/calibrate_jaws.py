@@ -239,7 +239,7 @@ class _EmptyJaws:
         return abs(self._transmission.force_n(current_a, self._middle_rad))
 
     def cycle(self, side: int, current_a: float, speed_share: float = 0.5) -> None:
-        """Runs one bus cycle towards a side, or with 0 at rest, at most at a share of the approach speed."""
+        """Runs one bus cycle towards ``side`` (0: at rest), at most at a share of the approach speed."""
         state = self._cycles.read()
         speed_m_s = speed_share * self._cycles.approach_m_s
         self._cycles.write(state.position_rad + side, min(current_a, self._ceiling_a), speed_m_s)
@@ -293,7 +293,7 @@ class _EmptyJaws:
                 )
 
     def friction(self, side: int, low_rad: float, high_rad: float) -> tuple[float, float]:
-        """Returns friction in N at which the jaws begin to move towards a side, and while they move."""
+        """Returns the friction in N of jaws that begin to move towards a side, and of jaws that move."""
         breakaway_a, running_n = [], []
         for share in _PLACES if side > 0 else reversed(_PLACES):
             goal_rad = low_rad + share * (high_rad - low_rad)
@@ -304,12 +304,12 @@ class _EmptyJaws:
         return self._force_n(float(np.median(breakaway_a))), max(float(np.median(running_n)), 0.0)
 
     def _move_beyond(self, goal_rad: float, side: int) -> None:
-        """Moves until a goal is passed, from either side, and at last towards ``side``."""
+        """Passes a goal in both directions, the second time towards ``side``."""
         self._progress("measuring friction", 0)
-        for way in (-side, side):
+        for direction in (-side, side):
             still = _Standstill(self.state.position_rad)
-            while way * (goal_rad + way * 0.05 - self.state.position_rad) > 0:
-                self.cycle(way, self._end_a)
+            while direction * (goal_rad + direction * 0.05 - self.state.position_rad) > 0:
+                self.cycle(direction, self._end_a)
                 if still.lasts(self.state.position_rad):
                     raise DataError(
                         f"the jaws stopped at {self.state.position_rad:.2f} rad, although they moved there before; "

@@ -212,7 +212,7 @@ class TrainConfig(Section):
 
     @property
     def replayed(self) -> int:
-        """Clips of a step, but for short ones, that are of an earlier training if its recordings are mixed in."""
+        """Clips of a step from an earlier training, if its recordings are mixed in; a step of short clips has more."""
         return round(self.replay_share * self.clips)
 
     def network(self, member: int) -> NetworkConfig:

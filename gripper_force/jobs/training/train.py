@@ -285,7 +285,7 @@ def _trained(
 def _batches(
     config: TrainConfig, clips: Sequence[Clip], replay_clips: Sequence[Clip], process: TrainingProcess
 ) -> Batches | Replay:
-    """Returns what draws the clips of a step, after a check that the processes can share them."""
+    """Returns the source of the clips of each step, after a check that the processes can share them."""
     replayed = config.replayed if replay_clips else 0
     if any(0 < part < process.world_size for part in (config.clips - replayed, replayed)):
         raise ConfigError(

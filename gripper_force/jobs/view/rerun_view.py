@@ -1,4 +1,4 @@
-"""Rerun (https://rerun.io): what of a log is drawn where, and the blueprint that arranges it."""
+"""Rerun (https://rerun.io): the place of each record of a log in the viewer, and the blueprint that arranges them."""
 
 import os
 import sys
