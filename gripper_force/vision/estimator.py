@@ -54,7 +54,8 @@ class ForceEstimator:
         """
         self._region, self._max_covered = region, max_covered
         self._engine = engine
-        self._preprocess = engine.header.preprocess
+        self._preprocess, members = engine.header.preprocess, engine.header.members
+        self._sizes = len(members), sum(member.head for member in members)
         self._correction = correction
         own = None if correction is None else correction.known
         self._ood = None if engine.header.ood is None else OodScore(engine.header.ood, own)
@@ -157,6 +158,8 @@ class ForceEstimator:
 
     def _estimate(self, step: StepOutput) -> ForceEstimate:
         """Returns the estimate for the networks' output."""
+        if (sizes := (len(step.forces_n), len(step.features))) != self._sizes:
+            raise ConfigError(f"the engine gave {sizes} forces and features, not {self._sizes}; correct it")
         forces: list[float] = step.forces_n.tolist()
         self._attention = step.attention
         if not all(math.isfinite(force) for force in forces):
@@ -173,9 +176,8 @@ class ForceEstimator:
             corrected_n = self._correction.force_n([force_n], features)
             return ForceEstimate(float(corrected_n[0]), float(self._correction.std_n(corrected_n)[0]))
         std_n = float(claimed_std_n(self._engine.header, step.forces_n[:, None])[0])
-        return ForceEstimate(
-            force_n, std_n if self._ood is None else std_n * float(self._ood.std_factor(score))
-        )
+        factor = 1.0 if self._ood is None else float(self._ood.std_factor(score))
+        return ForceEstimate(force_n, std_n * factor)
 
     def _limit(self) -> str:
         """Names the limit that a frame exceeds, and what to do."""
