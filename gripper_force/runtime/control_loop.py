@@ -49,6 +49,7 @@ class ControlLoop:
         self._thread: threading.Thread | None = None
         self.owner: Callable[[], object] = lambda: True
         self._cycle_lock = threading.RLock()  # of the thread that runs the cycle with background=False
+        self._in_cycle = False  # the same
         # Written by the thread that runs the control cycle; the first two exist once the loop is open:
         self.session: Session
         self.state: GripperState
@@ -68,6 +69,7 @@ class ControlLoop:
             else:
                 run = open_run(resolve(self._config), self._log, port=self._port)
                 self._start(self._resources.enter_context(run))
+                self._resources.enter_context(deferred_signals(self._interrupt))
         except BaseException as error:
             self._error, self._error_was_raised = error, True
             self.close(error)
@@ -107,10 +109,14 @@ class ControlLoop:
         with self._own_cycle():
             session = self.live_session()
             try:
-                return self._cycle(session)
+                self._in_cycle = True
+                self._cycle(session)
+                self._in_cycle = False
+                session.raise_if_interrupted()  # a later cycle may never come
             except BaseException as error:
                 self._error, self._error_was_raised = error, True
                 raise
+            return self.state
 
     def shown_state(self) -> GripperState:
         """Returns the newest state, without an outcome if a grasp or a move was requested after it.
@@ -185,6 +191,12 @@ class ControlLoop:
         if self._background:  # otherwise these resources are those of the run, too
             self._resources.close()
 
+    def _interrupt(self) -> None:
+        """Interrupts the program's own code at once, but a cycle of the caller's thread at its end."""
+        if not self._in_cycle or self._error is not None:
+            raise KeyboardInterrupt
+        self.session.interrupt()
+
     def _own_cycle(self) -> contextlib.ExitStack:
         """Lets only this thread run the control cycle: a second one would use the servo's port at the same time."""
         if not self._cycle_lock.acquire(blocking=False):
@@ -210,7 +222,7 @@ class ControlLoop:
     # The background thread.
 
     def _open_thread(self) -> None:
-        self._resources.enter_context(deferred_signals(_interrupt))
+        self._resources.enter_context(deferred_signals(self._interrupt))
         resolved = resolve(self._config)
         self._thread = threading.Thread(target=self._run_thread, args=[resolved], name="control", daemon=True)
         self._thread.start()
@@ -285,7 +297,3 @@ class ControlLoop:
         )
         self._requests.finish_cycle(request, refusal, self.state, result)
         return self.state
-
-
-def _interrupt() -> None:
-    raise KeyboardInterrupt

@@ -1246,6 +1246,30 @@ def test_a_handled_interrupt_is_raised_once(simulated: Open, monkeypatch: pytest
     gripper.close()
 
 
+@pytest.mark.usefixtures("own_process")
+def test_a_signal_between_cycles_ends_a_program_that_may_run_no_other(simulated: Open) -> None:
+    simulated()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGTERM)
+
+
+@pytest.mark.usefixtures("own_process")
+def test_a_signal_in_the_last_cycle_is_raised_at_its_end(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gripper, cycle, cycles = simulated(), ControlLoop._cycle, list[gf.GripperState]()
+
+    def with_signal(loop: ControlLoop, session: Session) -> gf.GripperState:
+        cycles.append(cycle(loop, session))
+        signal.raise_signal(signal.SIGTERM)
+        return cycles[-1]
+
+    monkeypatch.setattr(ControlLoop, "_cycle", with_signal)
+    with pytest.raises(KeyboardInterrupt):
+        gripper.step()
+    assert [state.phase for state in cycles] == [gf.Phase.OPEN]
+
+
 @pytest.mark.parametrize(("number", "background"), [(signal.SIGINT, True), (signal.SIGTERM, False)])
 def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(
     quick: list[str], server: PtyServer, number: signal.Signals, background: bool
