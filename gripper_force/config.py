@@ -739,7 +739,7 @@ def load_with_options(
         ConfigError: A file, key or value is wrong. The message names it.
     """
     where = str(path) if path else "--set"
-    tree = {} if path is None else read_tree(as_path(path, "the configuration", "or pass keys and values"))
+    tree = {} if path is None else read_tree(as_path(path, "the configuration", "or pass keys as overrides"))
     if not tree.keys().isdisjoint({"format", "family"}):
         raise ConfigError(
             f"{path} is not a configuration; pass a rig profile with --set calibration.rig={path}, an object "

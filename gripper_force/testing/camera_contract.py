@@ -4,8 +4,8 @@ Subclass `CameraContract` in a test module and override the fixture ``camera``::
 
     class TestMyCamera(CameraContract):
         @pytest.fixture
-        def camera(self):
-            return MyCamera(CameraConfig(backend="mine"), MonotonicClock())
+        def camera(self, clock):
+            return MyCamera(gf.CameraConfig(backend="my_package.cameras:MyCamera"), clock)
 
 The camera must deliver frames while the tests wait. If it needs help to do so (a trigger, a simulated clock),
 override ``wait`` too.

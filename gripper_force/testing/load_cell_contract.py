@@ -4,8 +4,8 @@ Subclass `LoadCellContract` in a test module and override the fixture ``load_cel
 
     class TestMyLoadCell(LoadCellContract):
         @pytest.fixture
-        def load_cell(self):
-            return MyLoadCell(LoadCellConfig(backend="mine"), MonotonicClock())
+        def load_cell(self, clock):
+            return MyLoadCell(gf.LoadCellConfig(backend="my_package.cells:MyLoadCell"), clock)
 
 The load cell must deliver samples while the tests wait. If it needs help to do so (a simulated clock, a stub
 of the vendor's library), override ``wait`` too.

@@ -5,7 +5,7 @@ Subclass `ServoContract` in a test module and override its fixtures::
     class TestMyServo(ServoContract):
         @pytest.fixture
         def config(self):
-            return ServoConfig(port="/dev/ttyUSB0")
+            return gf.ServoConfig(port="/dev/ttyUSB0")
 
         @pytest.fixture
         def servo(self, config):
