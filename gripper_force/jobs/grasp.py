@@ -68,7 +68,8 @@ class GraspSummary(_Score):
         object_gain: Gain of the object by motor current (see `gripper_force.control.object_gain`); None if it is not
             known, or the grasp was not held.
         object_gain_std: Its relative standard deviation.
-        object_gain_true: Stiffness of the simulated object over that of its kind; None for a real one.
+        object_gain_true: Stiffness of the simulated object over that of its kind; None for a real one, or without an
+            object.
         fell_back: True if the feedback includes vision, but less than half of the hold used it.
         load_cell_mean_n: Mean of the load cell over the last second of the hold.
         steady_error_n: That mean, less the target.
@@ -235,6 +236,7 @@ def summarise_grasp(path: Path) -> GraspSummary:
     result = outcomes[-1] if outcomes else "interrupted"
     # A grasp that was not held teaches no gain.
     gains = [fused for fused in records[FusedForce] if fused.object_gain and result == Outcome.HELD]
+    has_object = "scene" in reader.metadata and config.object != "none"  # a simulated one
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
     return {
         "result": result,
@@ -247,7 +249,7 @@ def summarise_grasp(path: Path) -> GraspSummary:
         "vision_losses": [] if shown is None else shown.losses,
         "object_gain": gains[-1].object_gain if gains else None,
         "object_gain_std": gains[-1].object_gain_std if gains else None,
-        "object_gain_true": stiffness_of(reader.metadata) if "scene" in reader.metadata else None,
+        "object_gain_true": stiffness_of(reader.metadata) if has_object else None,
         "fell_back": expects_vision and vision is not None and vision.share < MIN_VISION_SHARE,
         **_score(cells, statuses, config.target_n),
         "peak_n": max((c.force_n for c in cells if c.valid), default=None),

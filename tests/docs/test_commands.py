@@ -16,7 +16,7 @@ import typer
 
 from gripper_force import cli
 from gripper_force.config import Config, load_with_options
-from gripper_force.jobs.grasp import exclusive_device
+from gripper_force.jobs.grasp import GraspSummary, exclusive_device
 from gripper_force.jobs.training.recipe import TrainConfig, recipe, section_from
 from gripper_force.qualification.paper.models import Scale
 
@@ -174,3 +174,10 @@ def test_a_command_in_a_sentence_is_accepted(line: Line) -> None:
         command = command.commands["network"]  # `export` alone
     known = {name for parameter in command.params for name in parameter.opts} | {"--help"}
     assert not {word.partition("=")[0] for word in words if word.startswith("--")} - known
+
+
+def test_the_page_has_the_keys_of_a_grasp() -> None:
+    table = (ROOT / "docs/commands.md").read_text(encoding="utf-8").split("The keys of `grasp`:")[1]
+    rows = re.findall(r"^\| (`[^|]+) \|", table.partition("## ")[0], re.MULTILINE)
+    keys = [key for row in rows for key in INLINE.findall(row)]
+    assert sorted(keys) == sorted(GraspSummary.__annotations__)
