@@ -53,6 +53,10 @@ Fresh = Annotated[
 Pause = Annotated[
     bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
 ]
+PeakN = Annotated[
+    float | None,
+    typer.Option(help="Largest force of a touch in newtons. Default: 12 N, or what the force limit permits."),
+]
 TouchSeed = Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")]
 
 
@@ -242,13 +246,16 @@ def camera(
 def object_(
     name: Annotated[str, typer.Argument(help="Name of the object, or the file of a simulated one.")],
     touches: Annotated[int | None, typer.Option(min=1, help="Number of touches. Default: 8.")] = None,
-    peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
+    peak_n: PeakN = None,
     logs: Annotated[
         list[Path] | None,
         typer.Option("--from", help="Calibrate with these logs, or folders of them, without the devices."),
     ] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="Folder of the touches' logs; existing ones are not repeated.")
+        Path | None,
+        typer.Option(
+            help="Folder of the touches' logs; existing ones are not repeated. Default: data/touches/NAME."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
@@ -369,7 +376,7 @@ def teach(
     touches: Annotated[
         int | None, typer.Option(min=4, help="Number of touches, with those of earlier calls. Default: 16.")
     ] = None,
-    peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
+    peak_n: PeakN = None,
     logs: Annotated[
         list[Path] | None,
         typer.Option("--from", help="Teach with these logs, or folders of them, without the devices."),
@@ -382,7 +389,10 @@ def teach(
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(help="Folder of the touches and of the work so far; nothing in it is repeated."),
+        typer.Option(
+            help="Folder of the touches and of the work so far; nothing in it is repeated. Default: "
+            "data/touches/NAME."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the bundle. Default: NAME in your folder of profiles.")

@@ -34,7 +34,8 @@ def setup(
         ),
     ] = False,
     mass_kg: Annotated[
-        float | None, typer.Option(help="Known mass for the load cell, or to hang from one jaw without one.")
+        float | None,
+        typer.Option(help="Known mass for the load cell. Without a load cell it hangs from one jaw."),
     ] = None,
     gauge_mm: Annotated[
         float | None, typer.Option(help="Width of the load cell between the jaws, for the torque constant.")
