@@ -15,6 +15,7 @@ import pytest
 import typer
 
 from gripper_force import cli
+from gripper_force.cli.output.calibrate import SERVO
 from gripper_force.config import Config, load_with_options
 from gripper_force.jobs.grasp import GraspSummary, exclusive_device
 from gripper_force.jobs.training.recipe import TrainConfig, recipe, section_from
@@ -181,3 +182,11 @@ def test_the_page_has_the_keys_of_a_grasp() -> None:
     rows = re.findall(r"^\| (`[^|]+) \|", table.partition("## ")[0], re.MULTILINE)
     keys = [key for row in rows for key in INLINE.findall(row)]
     assert sorted(keys) == sorted(GraspSummary.__annotations__)
+
+
+def test_the_tutorial_has_lines_of_calibrate_servo() -> None:
+    page = (ROOT / "docs/tutorials/calibrate.md").read_text(encoding="utf-8")
+    block = page.partition("```text\n")[2].partition("```")[0]
+    names = [re.split(r" {2,}", line)[0] for line in block.splitlines()]
+    assert names
+    assert set(names) <= set(SERVO.values())
