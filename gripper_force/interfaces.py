@@ -122,7 +122,11 @@ class Camera(Protocol):
         """Opens the device and starts to capture."""
 
     def newest(self) -> Frame | None:
-        """Returns the newest frame that was not returned before, or None. Never blocks."""
+        """Returns the newest frame that was not returned before, or None. Never blocks.
+
+        A camera that is lost returns None until it is back: the run goes on with motor current alone. An exception
+        ends the run.
+        """
 
     def counts(self) -> dict[str, int]:
         """Returns the number of problems since construction by cause."""
@@ -142,7 +146,7 @@ class LoadCell(Protocol):
         """Opens the device and starts to sample."""
 
     def drain(self) -> list[LoadCellSample]:
-        """Returns all samples since the last call, oldest first. Never blocks."""
+        """Returns all samples since the last call, oldest first. Never blocks. An exception ends the run."""
 
     def counts(self) -> dict[str, int]:
         """Returns the number of problems since construction by cause."""
