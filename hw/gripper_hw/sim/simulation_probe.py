@@ -6,6 +6,7 @@ from contextlib import closing
 from gripper_force.config import Config
 from gripper_force.jobs.checks import Check, time_ms
 from gripper_force.plugins import require
+from gripper_force.runtime.backends import resolve_simulation
 
 _SIDE_PX = 16
 
@@ -24,11 +25,10 @@ def probe(config: Config) -> Iterator[Check]:
     from gripper_hw.dynamixel.control_table import load_model
     from gripper_hw.dynamixel.firmware import VirtualServo
     from gripper_hw.sim.scene import draw_scene, true_gripper
-    from gripper_hw.sim.simulated_rig import SimulatedRig
     from gripper_hw.sim.world import World
 
     model = load_model("XM430-W350")
-    config, _ = SimulatedRig.resolve(config)
+    config, _ = resolve_simulation(config)
     scene = draw_scene(config.object, config.seed, config.sim)
     world = World(scene, true_gripper(config), VirtualServo(1, model), model.nm_per_a, config.seed)
 
