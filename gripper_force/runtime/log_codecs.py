@@ -91,8 +91,7 @@ def _record_codec(record_type: type[Record]) -> Codec:
         if "std_n" in names:
             half_n = INTERVAL_STD * record.std_n
             message.low_n, message.high_n = record.force_n - half_n, record.force_n + half_n
-        data: bytes = message.SerializeToString()
-        return data
+        return bytes(message.SerializeToString())
 
     def decode(message: McapMessage) -> Record:
         return record_type(*values(message_class.FromString(message.data)))
@@ -110,8 +109,7 @@ def _timestamp(t_ns: int) -> timestamp_pb2.Timestamp:
 def _encode_event(event: Event, utc_offset_ns: int) -> bytes:
     timestamp = _timestamp(event.t_ns + utc_offset_ns)
     message = Log(timestamp=timestamp, level=Log.INFO, name=event.unit, message=event.text)
-    data: bytes = message.SerializeToString()
-    return data
+    return bytes(message.SerializeToString())
 
 
 def _decode_event(message: McapMessage) -> Event:
@@ -134,8 +132,7 @@ def _encode_image(frame: Frame | AttentionMap, utc_offset_ns: int) -> bytes:
         step=width,
         data=frame.gray.tobytes(),
     )
-    data: bytes = message.SerializeToString()
-    return data
+    return bytes(message.SerializeToString())
 
 
 def _decode_image(record_type: type[Frame | AttentionMap], message: McapMessage) -> Record:
@@ -160,11 +157,7 @@ def _image_codec(record_type: type[Frame | AttentionMap], topic: str) -> Codec:
 
 
 _LOG_SCHEMA: Final = _schema(timestamp_pb2.DESCRIPTOR, Log.DESCRIPTOR.file)
-_OWN: Final = {
-    record_type: _record_codec(record_type)
-    for record_type in get_args(Record)
-    if record_type not in (Frame, AttentionMap)
-}
+_OWN: Final = {kind: _record_codec(kind) for kind in get_args(Record) if kind not in (Frame, AttentionMap)}
 CODECS: Final[dict[type[Record], Codec]] = {
     **_OWN,
     Frame: _image_codec(Frame, "/frame"),
