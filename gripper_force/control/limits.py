@@ -138,9 +138,9 @@ class Limits:
         if self._step_a == 0:
             return wanted_a
         steps = round((wanted_a + self._rounding_a) / self._step_a)
-        steps = max(0, min(steps, math.floor(ceiling_a / self._step_a + 1e-9)))
+        steps = min(steps, math.floor(ceiling_a / self._step_a + 1e-9))
         given_a = min(steps * self._step_a, ceiling_a)
-        # Limited, so that no error accumulates while a limit holds the current down.
+        # Limited, so that no error accumulates while a limit holds the current down, and no current is negative.
         error_a = self._rounding_a + wanted_a - given_a
         self._rounding_a = min(max(error_a, -0.5 * self._step_a), 0.5 * self._step_a)
         return given_a

@@ -83,8 +83,17 @@ def test_no_estimate_drives_the_motor_force_out_of_its_plausible_range(
             motor_force_n = loop.step(0.05, target_n, estimate(force_n, bias_n=force_n))
             margin_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
             assert abs(motor_force_n - loop.reference_n) <= margin_n * (1 + 1e-9)
-    # No wind-up: a second of the opposite error takes effect at once.
-    assert loop.step(0.05, target_n, estimate(100.0)) < motor_force_n + 1e-9
+
+
+@pytest.mark.parametrize(("seen_n", "then_n", "side"), [(0.0, 4.2, -1), (100.0, 3.8, 1)])
+def test_however_long_an_error_lasts_its_opposite_takes_effect_at_once(
+    loop, transmission, seen_n, then_n, side
+):
+    ramp(loop, 4.0)
+    for _ in range(1000):
+        before_n = loop.step(0.05, 4.0, estimate(seen_n))
+    change_n = loop.step(0.005, 4.0, estimate(then_n)) - before_n
+    assert side * change_n == pytest.approx(0.75 * transmission.friction_n, abs=0.05)
 
 
 def test_retarget_starts_at_the_present_reference(loop, transmission):

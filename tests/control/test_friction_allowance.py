@@ -27,11 +27,14 @@ def closing_n(allowance):
     return allowance.allowance_n(0.95, opening=False, closing=True, gripping=False)
 
 
-def test_open_jaws_come_loose_with_the_configured_friction_for_a_while(allowance):
-    close(allowance, 0.25)
+@pytest.mark.parametrize("closing_m_s", [0.0, 0.3 * SPEED_M_S])
+def test_open_jaws_come_loose_with_the_configured_friction_for_a_while(allowance, closing_m_s):
+    close(allowance, 0.25, closing_m_s)
     assert closing_n(allowance) == 0.95
-    close(allowance, 0.1)
+    close(allowance, 0.1, closing_m_s)
     assert closing_n(allowance) == 0.0
+    # From now on the ceiling of the current counts on no friction.
+    assert allowance.max_closing_force_n(closing=True, approaching=False) == math.inf
 
 
 def test_jaws_that_have_moved_and_stop_are_in_contact(allowance):
@@ -40,6 +43,13 @@ def test_jaws_that_have_moved_and_stop_are_in_contact(allowance):
     assert closing_n(allowance) == 0.95
     close(allowance, 0.02)
     assert closing_n(allowance) == 0.0
+
+
+def test_jaws_that_moved_in_an_earlier_phase_may_have_to_come_loose_again(allowance):
+    close(allowance, 0.1, SPEED_M_S)
+    allowance.update(0.005, 0.0, SPEED_M_S, closing=False)
+    close(allowance, 0.2)
+    assert closing_n(allowance) == 0.95
 
 
 def test_another_phase_does_not_begin_the_time_anew(allowance):
@@ -63,11 +73,15 @@ def test_partly_closed_jaws_get_half_of_the_limit(allowance, transmission):
     assert allowance.max_closing_force_n(closing=True, approaching=True) == math.inf
 
 
-def test_a_move_that_comes_loose_gets_hardly_more_than_friction(allowance, transmission):
+@pytest.mark.parametrize("limit_n", [0.8, 14.0])
+def test_a_move_that_comes_loose_gets_half_of_the_limit_or_hardly_more_than_friction(transmission, limit_n):
+    allowance = FrictionAllowance(ControlConfig(force_limit_n=limit_n), transmission)
+    allowance.start_phase(from_open=True)
     close(allowance, 0.005)
     assert allowance.max_closing_force_n(closing=True, approaching=True) == math.inf
     most_n = allowance.max_closing_force_n(closing=True, approaching=False)
-    assert most_n == pytest.approx(transmission.friction_n + 0.1)
+    half_n = 0.5 * limit_n / transmission.torque_constant_bound
+    assert most_n == pytest.approx(max(half_n, transmission.friction_n + 0.1))
 
 
 def test_what_a_motion_shows_counts_from_then_on(allowance):
@@ -80,6 +94,8 @@ def test_what_a_motion_shows_counts_from_then_on(allowance):
     assert closing_n(allowance) == 0.4
     allowance.learn(0.6, only_lower=False)
     assert closing_n(allowance) == 0.6
+    allowance.learn(0.5, only_lower=True)
+    assert closing_n(allowance) == 0.5
 
 
 def test_a_grip_counts_on_what_its_own_grasp_has_shown(allowance):
@@ -87,6 +103,7 @@ def test_a_grip_counts_on_what_its_own_grasp_has_shown(allowance):
     allowance.start_grasp()
     gripping = {"opening": False, "closing": False, "gripping": True}
     assert allowance.allowance_n(0.95, **gripping) == 0.0
+    assert closing_n(allowance) == 0.4
     allowance.learn(0.4, only_lower=False)
     assert allowance.allowance_n(0.95, **gripping) == 0.4
 

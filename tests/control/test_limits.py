@@ -33,9 +33,14 @@ cycles = st.lists(
 
 
 @settings(deadline=None, max_examples=200)
-@given(cycles, st.sampled_from([COARSE, FINE]), st.floats(0.01, 3.0))
-def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
-    limits = Limits(CONFIG, transmission, limit_a)
+@given(
+    cycles,
+    st.sampled_from([COARSE, FINE]),
+    st.floats(0.01, 3.0),
+    st.sampled_from([CONFIG.ramp_n_s, 1e4]),  # the first one alone hardly reaches the other limits
+)
+def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a, ramp_n_s):
+    limits = Limits(ControlConfig(ramp_n_s=ramp_n_s), transmission, limit_a)
     last_a = 0.0
     for position_rad, current_a, force_n, friction_n, motor_force_n, dt_s, may_rise, opens in cycles:
         wanted = ServoCommand(0, position_rad, current_a)
@@ -47,14 +52,14 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
         cap_a = min(limit_a, cap_n / transmission.n_per_a(0.0))
         assert 0.0 <= out.goal_current_a <= cap_a
         low, high = transmission.goal_range_rad
-        assert low <= out.goal_position_rad <= high
+        assert out.goal_position_rad == min(max(position_rad, low), high)
         assert over == (force_n > CONFIG.force_limit_n)
         if (over and not opens) or not may_rise:
             assert out.goal_current_a <= last_a
         if over and not opens and motor_force_n > CONFIG.force_limit_n - friction_n:
             assert out.goal_current_a <= 0.85 * last_a
         # An output is off by at most one step from what it rounds: half of it is the carried rounding error.
-        rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a(0.0) * dt_s + 2 * transmission.current_step_a
+        rise_a = 4 * ramp_n_s / transmission.n_per_a(0.0) * dt_s + 2 * transmission.current_step_a
         assert out.goal_current_a <= last_a + rise_a + 1e-12
         last_a = out.goal_current_a
 
@@ -91,6 +96,16 @@ def test_rounding_keeps_the_mean_current(wanted_a):
     assert all(abs(a / COARSE.current_step_a - round(a / COARSE.current_step_a)) < 1e-6 for a in tail)
 
 
+def test_a_carried_rounding_error_never_makes_the_current_negative():
+    step_a = COARSE.current_step_a
+    for half_steps in range(1, 26, 2):
+        limits = Limits(CONFIG, COARSE, 1.0)
+        for wanted_a in (half_steps / 2 * step_a, 0.0):
+            wanted = ServoCommand(0, 0.0, wanted_a)
+            out, _ = limits.apply(wanted, 0.0, 0.95, 0.0, 0.0, 0.05, may_rise=True)
+        assert out.goal_current_a >= 0.0
+
+
 def test_over_force_halves_within_five_cycles():
     limits = Limits(CONFIG, FINE, 1.0)
     wanted = ServoCommand(0, 0.0, 0.2)
@@ -102,10 +117,11 @@ def test_over_force_halves_within_five_cycles():
     assert out.goal_current_a < 0.1
 
 
-def test_a_grip_whose_friction_is_unknown_rises_with_the_ramp():
+@pytest.mark.parametrize("closing_sign", [-1, 1])
+def test_a_grip_whose_friction_is_unknown_rises_with_the_ramp(closing_sign):
     risen_n = []
     for rises_slowly in (False, True):
-        limits = Limits(CONFIG, FINE, 1.0)
+        limits = Limits(CONFIG, replace(FINE, closing_sign=closing_sign), 1.0)
         for _ in range(4):
             out, _ = limits.apply(
                 ServoCommand(0, 0.0, 1.0),
@@ -131,6 +147,14 @@ def test_ceiling_keeps_the_force_limit_for_any_torque_constant(bound, share, bel
     assert gain * rig.force_n(ceiling_a, 0.0) - friction_n <= 1.05 * limit_n
 
 
+def test_friction_beyond_what_the_rig_may_have_does_not_raise_the_ceiling():
+    limits = Limits(CONFIG, FINE, 99.0)
+    most_n = (1 + 3 * FINE.friction_std) * FINE.friction_n
+    assert limits.ceiling_a(0.0, 0.0) < limits.ceiling_a(0.9 * most_n, 0.0) < limits.ceiling_a(most_n, 0.0)
+    assert limits.ceiling_a(10 * most_n, 0.0) == limits.ceiling_a(most_n, 0.0)
+    assert limits.ceiling_a(-1.0, 0.0) == limits.ceiling_a(0.0, 0.0)
+
+
 def test_current_that_caused_an_over_force_is_not_reached_again():
     limits = Limits(CONFIG, FINE, 1.0)
     wanted = ServoCommand(0, 0.0, 0.2)
@@ -142,10 +166,31 @@ def test_current_that_caused_an_over_force_is_not_reached_again():
         ]
 
     assert run(5.0)[-1] == pytest.approx(0.2)
-    assert run(15.0, 3)[-1] < 0.15
+    low_a = run(15.0, 3)[-1]
+    assert low_a < 0.15
+    # It comes back with the force ramp only.
+    assert run(5.0, 1)[0] - low_a == pytest.approx(CONFIG.ramp_n_s * 0.005 / FINE.n_per_a(0.0))
     assert run(5.0)[-1] == pytest.approx(0.95 * 0.2)
     limits.reset()
     assert run(5.0)[-1] == pytest.approx(0.2)
+
+
+def test_a_force_over_its_limit_does_not_lower_the_current_of_jaws_that_open():
+    limits, wanted = Limits(CONFIG, FINE, 1.0), ServoCommand(0, 0.0, 0.2)
+    for force_n in (5.0, 15.0):
+        for _ in range(100):
+            out, _ = limits.apply(wanted, force_n, 0.95, 16.0, 0.0, 0.005, may_rise=True, opening=True)
+        assert out.goal_current_a == pytest.approx(0.2)
+
+
+def test_rounding_errors_do_not_add_up_while_a_limit_holds_the_current_down():
+    step_a = COARSE.current_step_a
+    limits = Limits(CONFIG, COARSE, 10.9 * step_a)
+    for _ in range(400):
+        out, _ = limits.apply(ServoCommand(0, 0.0, 5.0), 0.0, 0.95, 0.0, 0.0, 0.005, may_rise=True)
+    assert out.goal_current_a == pytest.approx(10 * step_a)  # the servo would round 10.9 steps up
+    out, _ = limits.apply(ServoCommand(0, 0.0, 5 * step_a), 0.0, 0.95, 0.0, 0.0, 0.005, may_rise=True)
+    assert out.goal_current_a <= 6 * step_a
 
 
 def test_force_kept_up_by_friction_does_not_lower_the_current_further():
@@ -162,8 +207,9 @@ def test_force_kept_up_by_friction_does_not_lower_the_current_further():
 def test_the_current_limit_is_told_from_other_limits(current_limit_a, holds):
     limits = Limits(CONFIG, FINE, current_limit_a)
     for _ in range(400):
-        limits.apply(ServoCommand(0, 0.0, 5.0), 1.0, 0.95, 6.0, 0.0, 0.005, may_rise=True)
+        out, _ = limits.apply(ServoCommand(0, 0.0, 5.0), 1.0, 0.95, 6.0, 0.0, 0.005, may_rise=True)
     assert limits.is_at_current_limit is holds
+    assert out.goal_current_a <= current_limit_a
 
 
 def test_the_largest_target_leaves_room_below_the_limit():

@@ -16,8 +16,9 @@ def cycles_until_lost(**changes):
     return None
 
 
-def test_closing_without_resistance_is_a_loss_within_50_ms():
-    assert cycles_until_lost() <= 9
+@pytest.mark.parametrize(("shortfall_n", "reference_n"), [(3.0, 4.0), (0.5, 0.6)])
+def test_closing_without_resistance_is_a_loss_within_50_ms(shortfall_n, reference_n):
+    assert cycles_until_lost(shortfall_n=shortfall_n, reference_n=reference_n) <= 9
 
 
 def test_jaws_that_the_speed_limit_brakes_in_every_second_cycle_are_a_loss():
@@ -99,6 +100,7 @@ def test_collapsed_force_is_a_slip_after_its_time():
     assert "fell to 1.90 N" in found[20]
     monitor.start()
     assert not monitor.slip_reason(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0)
+    assert not any(monitor.slip_reason(0.005, 2.1, 4.0, 0.0, closing_m_s=0.0) for _ in range(25))
 
 
 def test_collapsed_force_of_closing_jaws_is_a_slip_after_half_the_time():

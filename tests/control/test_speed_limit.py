@@ -54,7 +54,7 @@ def test_blocked_jaws_come_to_their_goal_current(transmission, direction, share)
     assert direction * current_a == pytest.approx(min(0.5, 1.3 * share * 0.5))
 
 
-@pytest.mark.parametrize("current_a", [0.0, -0.1])
+@pytest.mark.parametrize("current_a", [0.0, -0.1, 0.1])
 def test_jaws_that_nothing_resists_do_not_get_the_lead_of_a_grip(transmission, current_a):
     # The brake has just stopped them. With the lead of the goal current they were too fast in every second cycle.
     command = SpeedLimit(transmission, POSITION_LOOP).apply(
@@ -63,17 +63,30 @@ def test_jaws_that_nothing_resists_do_not_get_the_lead_of_a_grip(transmission, c
     assert RADIUS_M * POSITION_LOOP.gain_per_s * command.goal_position_rad == pytest.approx(1.3 * 0.01)
 
 
-def test_servo_brakes_above_the_speed(transmission):
+@pytest.mark.parametrize("way", [-1, 1])
+def test_servo_brakes_above_the_speed(transmission, way):
     limit = SpeedLimit(transmission, POSITION_LOOP)
-    fast = reading(0.5, 1.5 * 0.025 / RADIUS_M)
-    assert limit.apply(ServoCommand(0, 2.0, 0.1), fast, 0.025).goal_position_rad == 0.5
-    assert limit.apply(ServoCommand(0, 0.0, 0.1), fast, 0.025).goal_position_rad < 0.5
-    assert limit.apply(ServoCommand(0, 2.0, 0.1), fast, 0.05).goal_position_rad > 0.5
+    fast = reading(0.5, way * 1.5 * 0.025 / RADIUS_M)
+
+    def lead_rad(goal_rad, speed_m_s):
+        command = ServoCommand(0, 0.5 + way * goal_rad, 0.1)
+        return way * (limit.apply(command, fast, speed_m_s).goal_position_rad - 0.5)
+
+    assert lead_rad(1.5, 0.025) == 0.0
+    assert lead_rad(-0.5, 0.025) < 0.0
+    assert lead_rad(1.5, 0.05) > 0.0
 
 
 def test_unknown_position_loop_has_a_lead_of_2_mm(transmission):
     command = SpeedLimit(transmission, None).apply(ServoCommand(0, 9.0, 0.1), reading(0.5), 0.025)
     assert command.goal_position_rad - 0.5 == pytest.approx(0.002 / RADIUS_M)
+
+
+@pytest.mark.parametrize("current_a", [-0.1, 0.1])
+def test_jaws_may_stop_short_of_their_goal_by_the_lead_that_friction_needs(transmission, current_a):
+    short_m = SpeedLimit(transmission, POSITION_LOOP).rest_error_m(current_a, 0.0)
+    assert short_m == pytest.approx(2 * RADIUS_M * 1.3 * 0.1 / POSITION_LOOP.a_per_rad)
+    assert SpeedLimit(transmission, None).rest_error_m(current_a, 0.0) == 0.0
 
 
 @given(
