@@ -84,6 +84,10 @@ def test_a_move_that_comes_loose_gets_half_of_the_limit_or_hardly_more_than_fric
     assert most_n == pytest.approx(max(half_n, transmission.friction_n + 0.1))
 
 
+def test_open_jaws_in_contact_keep_the_motor_force_of_their_approach(allowance):
+    assert allowance.max_closing_force_n(closing=False, approaching=False) == math.inf
+
+
 def test_what_a_motion_shows_counts_from_then_on(allowance):
     allowance.learn(None, only_lower=False)
     assert allowance.shown_n == math.inf

@@ -65,6 +65,21 @@ def test_a_move_onto_an_object_keeps_the_force_limit_whatever_friction_is_config
     assert 0.0 < run.go(2.0).plant.peak_n <= 1.05 * limit_n
 
 
+@pytest.mark.parametrize(
+    ("x_m", "limit_n", "most_n"),
+    [
+        (0.02, 4.0, 0.5 * 4.0 / 1.4),  # jaws that may touch an object: half of what the force limit allows
+        (0.0, 4.0, 0.5 * 4.0 / 1.4),
+        (0.0, 2.0, 0.95 + 0.1),  # open jaws: hardly more than the configured friction, to come loose
+    ],
+)
+def test_a_move_presses_gently_until_a_motion_has_shown_the_friction(make_run, x_m, limit_n, most_n):
+    plant = {**FAR, "x_m": x_m, "friction_n": 5.0}  # nothing moves
+    run = make_run(plant=plant, force_limit_n=limit_n, approach_force_n=1.9).move(0.02, 0.25)
+    most_a = max(decision.command.goal_current_a for decision in run.decisions)
+    assert most_a == pytest.approx(most_n / run.transmission.n_per_a(0.0), abs=run.transmission.current_step_a)
+
+
 @settings(max_examples=15)
 @given(
     start_m=st.floats(0.0, 0.044),

@@ -83,6 +83,15 @@ def test_fast_rotation_is_no_jump():
         assert not check(safety, moved)
 
 
+@pytest.mark.parametrize(("time_ms", "largest_rad"), [(-5, 0.05), (0, 0.05), (5, 0.15), (50, 1.05)])
+def test_the_largest_plausible_rotation_grows_with_the_time(time_ms, largest_rad):
+    for leap_rad, trips in ((0.99 * largest_rad, False), (1.01 * largest_rad, True)):
+        safety = SafetyLatch(CONFIG)
+        check(safety, replace(WELL, t_ns=10_000_000))
+        moved = replace(WELL, t_ns=(10 + time_ms) * 1_000_000, position_rad=WELL.position_rad - leap_rad)
+        assert check(safety, moved) == trips
+
+
 def test_force_that_stays_over_its_limit_trips():
     safety = SafetyLatch(CONFIG)
     assert not any(check(safety, WELL, over_force=i % 40 != 0) for i in range(400))
@@ -99,13 +108,14 @@ def test_motor_current_above_its_goal_trips():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_motor_that_is_back_driven_may_draw_more_than_its_goal(sign):
+@pytest.mark.parametrize("rad_s", [-0.03, 0.3])
+def test_motor_that_is_back_driven_may_draw_more_than_its_goal(sign, rad_s):
     safety = SafetyLatch(CONFIG)
-    pulled, still = (
-        replace(WELL, current_a=sign * 0.3, velocity_rad_s=-sign * rad_s) for rad_s in (0.3, 0.03)
+    pulled, not_pulled = (
+        replace(WELL, current_a=sign * 0.3, velocity_rad_s=sign * each_rad_s) for each_rad_s in (-0.3, rad_s)
     )
     assert not any(check(safety, pulled) for _ in range(100))
-    assert any(check(safety, still) for _ in range(6))
+    assert any(check(safety, not_pulled) for _ in range(6))
 
 
 @given(st.integers(1, 5))
@@ -124,6 +134,10 @@ def test_a_hotter_servo_never_holds_more(temperature_c, hotter_c):
     cooler, hotter = safety.derating(temperature_c), safety.derating(temperature_c + hotter_c)
     assert 0.6 <= hotter <= cooler <= 1.0
     assert cooler == 1.0 or temperature_c > CONFIG.warm_c
+
+
+def test_half_way_to_its_temperature_limit_a_servo_holds_four_fifths():
+    assert SafetyLatch(CONFIG).derating(65.0) == pytest.approx(0.8)
 
 
 readings = st.builds(

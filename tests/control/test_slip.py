@@ -77,8 +77,16 @@ def test_jaws_that_close_without_more_motor_force_hold_nothing():
     assert "without more motor force" in receding(SlipMonitor(CONFIG, HOLD_M_S), motor_force_n=0.48)[0]
 
 
-def test_jaws_that_close_with_more_motor_force_still_hold():
-    assert not receding(SlipMonitor(CONFIG, HOLD_M_S), motor_force_n=1.5)
+@pytest.mark.parametrize("motor_force_n", [1.5, 0.0])
+def test_jaws_that_close_with_another_motor_force_still_hold(motor_force_n):
+    assert not receding(SlipMonitor(CONFIG, HOLD_M_S), motor_force_n=motor_force_n)
+
+
+def test_a_recession_counts_from_the_last_rest():
+    monitor = SlipMonitor(CONFIG, HOLD_M_S)
+    assert not monitor.recession_reason(0.0493, 0.05, 0.0, 0.5)
+    assert not monitor.recession_reason(0.0491, 0.05, 0.01, 0.5)
+    assert monitor.recession_reason(0.0487, 0.05, 0.01, 0.5)
 
 
 def test_jaws_that_have_not_been_at_rest_yet_still_close_on_the_object():
