@@ -117,7 +117,7 @@ class ForceLoop:
         self._may_lower_at_once, self._repeat_left_s = lowers, _REPEAT_WITHIN_S if lowers else 0.0
         keeps_direction = self.is_lowering == lowers
         self._waited_s = 0.0
-        if not (keeps_direction and lowers):
+        if not keeps_direction:
             self._lowering_start_n = self.reference_n
         speed_n_s = self._profile.speed if keeps_direction else 0.0
         self._start_ramp(self.reference_n, target_n, lowers=lowers, speed_n_s=speed_n_s)
@@ -198,15 +198,16 @@ class ForceLoop:
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if the camera shows that it has stayed too high."""
-        rests = not self.is_lowering and self.reference_n == target_n
+        if self.is_lowering or self._repeat_left_s <= 0:
+            self._too_high_s = 0.0
+            return
         excess_n = 0.0 if estimate.source == EstimateSource.CURRENT else estimate.force_n - target_n
         is_high = excess_n > _REPEAT_SHARE * tolerance_n(target_n)
-        self._too_high_s = self._too_high_s + dt_s if rests and is_high else 0.0
-        if rests and self._repeat_left_s > 0:
-            self._repeat_left_s -= dt_s
-            if self._too_high_s > _REPEAT_S:
-                self._repeat_left_s = 0.0
-                self._start_ramp(min(estimate.force_n, self._lowering_start_n), target_n)
+        self._too_high_s = self._too_high_s + dt_s if is_high else 0.0
+        self._repeat_left_s -= dt_s
+        if self._too_high_s > _REPEAT_S:
+            self._repeat_left_s = 0.0
+            self._start_ramp(min(estimate.force_n, self._lowering_start_n), target_n)
 
     def _beyond_deadband(self, error_n: float, band_n: float) -> float:
         forward_n = -error_n if self._is_reversed else error_n

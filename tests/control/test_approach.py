@@ -186,7 +186,11 @@ def test_free_motion_needs_steady_speed_and_force(approach):
         assert approach.moves_freely(speed_m_s, approach.motor_force_n) == is_free
     approach.step(0.005, START_M - 0.001, 0.025, approach.motor_force_n + 1.0, estimate())  # noise
     assert approach.moves_freely(0.025, approach.motor_force_n)
-    for difference_n, is_free in ((-1.0, True), (0.2, True), (1.0, False)):  # the speed limit keeps the motor force low
+    for difference_n, is_free in (
+        (-1.0, True),
+        (0.2, True),
+        (1.0, False),
+    ):  # the speed limit keeps the motor force low
         for _ in range(30):
             approach.step(0.005, START_M - 0.001, 0.025, approach.motor_force_n + difference_n, estimate())
         assert approach.moves_freely(0.025, approach.motor_force_n) == is_free

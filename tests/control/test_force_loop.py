@@ -18,6 +18,15 @@ def ramp(loop, target_n, bias_n=0.0):
     return motor_force_n
 
 
+def lower(loop, target_n, seen_n=0.0, source="fused"):
+    """Lowers the force, and sees ``seen_n`` beside the reference. Returns the first motor force at rest."""
+    loop.retarget(target_n)
+    motor_force_n = 0.0
+    while loop.is_lowering:
+        motor_force_n = loop.step(0.005, target_n, estimate(loop.reference_n + seen_n, source=source))
+    return motor_force_n
+
+
 @pytest.fixture
 def loop(transmission):
     loop = ForceLoop(ControlConfig(), transmission)
@@ -54,12 +63,15 @@ def test_hold_ignores_a_small_error(loop):
         assert held_n == pytest.approx(motor_force_n)
 
 
-def test_hold_integrates_a_missing_force(loop):
+def test_hold_integrates_a_missing_force_that_the_camera_sees(loop):
     motor_force_n = ramp(loop, 4.0)
     for _ in range(100):
         raised_n = loop.step(0.005, 4.0, estimate(3.8))
     gain = loop_gains(ControlConfig(), vision_alone=False).integral_s
     assert raised_n - motor_force_n == pytest.approx(0.5 * 0.2 * gain)
+    for _ in range(100):
+        by_current_n = loop.step(0.005, 4.0, estimate(3.8, source="current"))
+    assert by_current_n == raised_n
 
 
 def test_too_much_force_reverses_the_motor_force_within_friction(loop, transmission):
@@ -83,6 +95,7 @@ def test_no_estimate_drives_the_motor_force_out_of_its_plausible_range(
             motor_force_n = loop.step(0.05, target_n, estimate(force_n, bias_n=force_n))
             margin_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
             assert abs(motor_force_n - loop.reference_n) <= margin_n * (1 + 1e-9)
+            assert motor_force_n >= 0.0
 
 
 @pytest.mark.parametrize(("seen_n", "then_n", "side"), [(0.0, 4.2, -1), (100.0, 3.8, 1)])
@@ -111,7 +124,30 @@ def test_lower_targets_within_the_tolerance_add_up_before_the_jaws_open(loop):
         loop.retarget(target_n)
         loop.step(0.005, target_n, estimate(4.0))
         lowered.append(loop.is_lowering)
+        ramp(loop, target_n)
     assert lowered == [False, False, False, True]
+    lower(loop, 2.0)
+    loop.retarget(1.95)  # they count from the newest lowering on
+    assert not loop.is_lowering
+
+
+@pytest.mark.parametrize(("target_n", "error_n"), [(1.0, 0.1), (10.0, 0.4)])
+def test_the_tolerance_is_4_percent_and_at_least_100_mn(target_n, error_n):
+    assert tolerance_n(target_n) == pytest.approx(error_n)
+
+
+def test_a_ramp_starts_softly_and_keeps_its_speed_towards_a_newer_target(loop):
+    for _ in range(20):
+        loop.step(0.005, 4.0, estimate(0.5))
+    assert loop.reference_n - 0.5 == pytest.approx(0.5 * 8.0 / 0.4 * 0.1**2, abs=0.01)
+    strides_n = []
+    for target_n in (4.0, 5.0, 0.3):
+        loop.retarget(target_n)
+        before_n = loop.reference_n
+        loop.step(0.005, target_n, estimate(0.5))
+        strides_n.append(loop.reference_n - before_n)
+    assert 0.01 < strides_n[0] < strides_n[1]
+    assert -0.003 < strides_n[2] < 0.0  # the other direction begins at rest
 
 
 def test_a_first_ramp_that_lowers_takes_a_still_lower_target(loop):
@@ -171,24 +207,95 @@ def test_one_visual_outlier_at_the_end_of_a_lowering_changes_nothing(transmissio
     loop.start(0.5, 4.0)
     ramp(loop, 4.0)
     loop.retarget(2.0)
-    was_lowering = True
-    for _ in range(100):
-        ends = was_lowering and not loop.is_lowering
-        was_lowering = loop.is_lowering
-        seen_n = outlier_n if loop.is_lowering or ends else 2.0
+    while loop.is_lowering:
+        before_n = loop.reference_n
+        loop.step(0.005, 2.0, estimate(outlier_n, source="vision"))
+        assert loop.reference_n <= before_n
+    for seen_n in (outlier_n, *[2.0] * 50):
         loop.step(0.005, 2.0, estimate(seen_n, source="vision"))
-    assert not loop.is_lowering
-    assert loop.reference_n == 2.0
+        assert not loop.is_lowering
+        assert loop.reference_n == 2.0
+
+
+@pytest.mark.parametrize(("outlier_n", "from_n"), [(2.5, 2.5), (9.0, 4.0)])
+def test_a_second_lowering_does_not_begin_above_the_first_one(loop, outlier_n, from_n):
+    ramp(loop, 4.0)
+    loop.retarget(2.0)
+    references_n = [loop.reference_n]
+    while loop.reference_n <= references_n[-1]:
+        references_n.append(loop.reference_n)
+        loop.step(0.005, 2.0, estimate(outlier_n if len(references_n) > 30 else 2.0, source="current"))
+    assert loop.reference_n == pytest.approx(from_n, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("share", "source", "every", "after_s", "is_repeated"),
+    [
+        (0.8, "fused", 1, 0.0, True),
+        (0.8, "vision", 1, 0.0, True),
+        (70.0, "fused", 1, 0.0, True),
+        (0.7, "fused", 1, 0.0, False),
+        (0.8, "current", 1, 0.0, False),
+        (0.8, "fused", 20, 0.0, False),  # not for long enough
+        (0.8, "fused", 1, 1.0, False),  # something else than the lowering
+    ],
+)
+def test_a_lowering_is_repeated_if_the_camera_sees_too_much_force(
+    loop, share, source, every, after_s, is_repeated
+):
+    ramp(loop, 4.0)
+    lower(loop, 2.0, seen_n=0.08)  # during the lowering it does not count
+    seen_n = [2.0] * round(after_s / 0.005)
+    seen_n += [2.0 if i % every == 1 else 2.0 + share * tolerance_n(2.0) for i in range(300)]
+    starts = []
+    for i, force_n in enumerate(seen_n):
+        was_lowering = loop.is_lowering
+        loop.step(0.005, 2.0, estimate(force_n, source=source))
+        if loop.is_lowering and not was_lowering:
+            starts.append(i)
+            assert 2.0 < loop.reference_n <= min(force_n, 4.0)
+    assert starts == ([pytest.approx(100, abs=2)] if is_repeated else [])
+
+
+def test_too_much_force_before_a_lowering_does_not_count_after_it(loop):
+    ramp(loop, 4.0)
+    for target_n in (2.0, 1.0):
+        lower(loop, target_n)
+        for _ in range(90):
+            loop.step(0.005, target_n, estimate(target_n + 0.08))
+            assert not loop.is_lowering
+
+
+@pytest.mark.parametrize("how", ["start", "retarget"])
+def test_too_much_force_after_a_rise_starts_no_lowering(loop, how):
+    ramp(loop, 4.0)
+    lower(loop, 2.0)
+    loop.start(2.0, 3.0) if how == "start" else loop.retarget(3.0)
+    ramp(loop, 3.0)
+    for _ in range(300):
+        loop.step(0.005, 3.0, estimate(3.0 + 0.9 * tolerance_n(3.0)))
+        assert not loop.is_lowering
+
+
+def test_the_integral_waits_for_the_end_of_a_lowering(loop, transmission):
+    ramp(loop, 4.0)
+    ended_n = lower(loop, 2.0, seen_n=-0.5)
+    one_cycle_n = 0.5 * 0.005 * loop_gains(ControlConfig(), vision_alone=False).integral_s
+    assert ended_n == pytest.approx(2.0 + transmission.friction_n + one_cycle_n)
 
 
 @pytest.mark.parametrize("closing_m_s", [-0.05, -1.0])
 def test_a_lowering_ends_whatever_the_measured_speed(loop, closing_m_s):
     ramp(loop, 4.0)
-    loop.retarget(2.0)
-    for _ in range(300):
-        loop.step(0.005, 2.0, estimate(loop.reference_n), closing_m_s=closing_m_s)
-    assert loop.reference_n == 2.0
-    assert not loop.is_lowering
+    for begin in (lambda: loop.retarget(2.0), lambda: loop.retarget(1.0), lambda: loop.start(3.0, 2.0)):
+        begin()
+        start_n, target_n = loop.reference_n, round(loop.reference_n / 2)
+        for cycle in range(300):
+            loop.step(0.005, target_n, estimate(loop.reference_n), closing_m_s=closing_m_s)
+            if cycle == 195:
+                assert loop.reference_n == start_n
+        assert loop.reference_n == target_n
+        assert not loop.is_lowering
 
 
 def test_a_lowering_waits_while_the_jaws_open_fast(loop):
@@ -212,6 +319,24 @@ def test_ramp_and_integral_wait_while_the_motor_force_falls_short(loop):
     assert loop.reference_n == before_n
     held_n = ramp(loop, 4.0)
     assert loop.step(0.005, 4.0, estimate(3.0), shortfall_n=2.0) == pytest.approx(held_n)
+
+
+@pytest.mark.parametrize(("shortfall_n", "waits"), [(0.5, False), (0.7, True)])
+def test_a_shortfall_of_a_fifth_and_200_mn_does_not_count(loop, shortfall_n, waits):
+    while loop.reference_n < 2.0:
+        loop.step(0.005, 4.0, estimate(loop.reference_n))
+    before_n = loop.reference_n
+    loop.step(0.005, 4.0, estimate(before_n), shortfall_n=shortfall_n)
+    assert (loop.reference_n == before_n) == waits
+
+
+def test_vision_alone_begins_each_grasp_without_the_trim_of_the_last_one(transmission):
+    loop = ForceLoop(ControlConfig(feedback="vision"), transmission)
+    for _ in range(2):
+        loop.start(0.5, 4.0)
+        assert ramp(loop, 4.0) == pytest.approx(4.0 + transmission.friction_n)
+        for _ in range(100):
+            loop.step(0.005, 4.0, estimate(3.8, source="vision"))
 
 
 def test_vision_alone_waits_for_the_ramp(transmission):

@@ -77,7 +77,9 @@ def test_a_move_presses_gently_until_a_motion_has_shown_the_friction(make_run, x
     plant = {**FAR, "x_m": x_m, "friction_n": 5.0}  # nothing moves
     run = make_run(plant=plant, force_limit_n=limit_n, approach_force_n=1.9).move(0.02, 0.25)
     most_a = max(decision.command.goal_current_a for decision in run.decisions)
-    assert most_a == pytest.approx(most_n / run.transmission.n_per_a(0.0), abs=run.transmission.current_step_a)
+    assert most_a == pytest.approx(
+        most_n / run.transmission.n_per_a(0.0), abs=run.transmission.current_step_a
+    )
 
 
 @settings(max_examples=15)
