@@ -13,7 +13,9 @@ HEAD = """# Configuration
 All keys and their defaults. A default of `null` means no value. A `--config` file is YAML (`control: {force_limit_n: 8}`);
 `--set control.force_limit_n=8` overrides it. Units are part of the names. A relative path is
 relative to the folder of the command, not to that of the file. An unknown key is an error. `gripper-force config schema` prints the JSON schema for editors.
-
+"""
+SECTION = """
+## {}
 | key | default | meaning |
 |---|---|---|
 """
@@ -38,14 +40,16 @@ def shown(value: Any) -> str:
 
 
 def page() -> str:
-    rows = [
-        f"| `{key}` | {'-' if key == 'faults' else shown(field.default)} | {field.description} |"
-        for key, field in keys(Config)
-    ]
+    sections: dict[str, str] = {}
+    for key, field in keys(Config):
+        name = key.partition(".")[0] if "." in key else "The run"
+        default = "-" if key == "faults" else shown(field.default)
+        row = f"| `{key}` | {default} | {field.description} |\n"
+        sections[name] = sections.get(name, SECTION.format(name)) + row
     faults = [
         f"| {unit} | {kind} | {what} |" for unit, kinds in FAULTS.items() for kind, what in kinds.items()
     ]
-    return HEAD + "\n".join(rows) + "\n" + FAULTS_HEAD + "\n".join(faults) + "\n"
+    return HEAD + "".join(sections.values()) + FAULTS_HEAD + "\n".join(faults) + "\n"
 
 
 def test_the_page_is_up_to_date() -> None:
