@@ -651,7 +651,7 @@ class GraspController:
             reason = f"not held within {self._timeout_s:.3g} s"
             if objection := self._objection:
                 reason += (
-                    f": {objection}. Look whether there is an object, in full view. "
+                    f": {objection}. Check whether there is an object, in full view. "
                     "The jaws may press on an end stop: check gripper.open_width_m with `calibrate jaws`. "
                     "If there is an object, calibrate it, or set control.feedback=current"
                 )
