@@ -32,6 +32,7 @@ body {{ font: 15px/1.45 system-ui, sans-serif; max-width: 70em; margin: 2em auto
 section {{ overflow-x: auto; }}
 table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; }}
 th, td {{ text-align: left; padding: .25em .9em .25em 0; border-bottom: 1px solid #8884; white-space: nowrap; }}
+td:nth-child(2):last-child {{ white-space: normal; min-width: 20em; }}
 td.number {{ text-align: right; }}
 </style></head><body><h1>{title}</h1>
 {sections}
