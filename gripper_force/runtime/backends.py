@@ -57,8 +57,7 @@ def load_servo_class(config: Config) -> Any:
 
 def is_simulated(config: Config) -> bool:
     """Returns True if the run has a simulated world."""
-    devices = (config.camera.backend, config.load_cell.backend)
-    return "simulated" in devices or config.servo.is_virtual
+    return "simulated" in (config.camera.backend, config.load_cell.backend) or config.servo.is_virtual
 
 
 def resolve_simulation(config: Config) -> tuple[Config, str]:
