@@ -191,7 +191,7 @@ def object_table(r: "ObjectCalibration") -> None:
             else f"gain {plant.gain:.2f}, lag {plant.lag_ms:.0f} ms, delay {plant.delay_ms:.0f} ms, "
             f"phase margin {plant.phase_margin_deg:.0f} degrees",
             "profile": str(r.profile_path),
-            "report": str(r.report_path),
+            "figure": str(r.report_path),
         }
     )
 
