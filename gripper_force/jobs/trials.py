@@ -91,7 +91,7 @@ def trials(
     if same_object:
         if workers > 1 or len(objects) > 1:
             raise ConfigError(
-                "grasps of the same object follow one another; pass one --object, and no --jobs but 1"
+                "grasps of the same object follow one another; pass one --object, and leave out --jobs"
             )
         config = with_same_object(config)
     plan = _planned(config, count, objects, target_n)
