@@ -104,11 +104,12 @@ def test_each_refusal_reaches_its_own_caller(cycle: Cycle) -> None:
     assert failure(second).endswith("too cold")
 
 
-def test_a_newer_request_of_another_kind_replaces(cycle: Cycle) -> None:
+@pytest.mark.parametrize("outcome", [Outcome.NONE, Outcome.FAULT])
+def test_a_newer_request_of_another_kind_replaces(cycle: Cycle, outcome: Outcome) -> None:
     grasp = cycle.submit(RequestKind.GRASP)
     cycle.run(Phase.APPROACH)
     release = cycle.submit(RequestKind.RELEASE, wait=False)
-    assert cycle.run(Phase.RELEASE) is release
+    assert cycle.run(Phase.RELEASE, outcome) is release
     assert failure(grasp) == "the grasp request was replaced by a release request"
 
 
@@ -132,8 +133,9 @@ def test_callers_of_the_same_kind_get_the_same_result(cycle: Cycle) -> None:
 
 @pytest.mark.parametrize("kind", [RequestKind.GRASP, RequestKind.MOVE])
 def test_at_fault_only_a_release_is_accepted(cycle: Cycle, kind: RequestKind) -> None:
+    cycle.state = replace(STATE, reason="too hot")
     cycle.run(Phase.FAULT, Outcome.FAULT)
-    with pytest.raises(RequestError, match=f"the {kind} request was refused: stopped or in fault"):
+    with pytest.raises(RequestError, match=rf"the {kind} request was refused: stopped or in fault \(too hot\);"):
         cycle.submit(kind)
     cycle.submit(RequestKind.RELEASE)
     cycle.submit(kind)  # the release before it may end the fault
@@ -201,6 +203,21 @@ def test_closing_ends_every_call_and_refuses_later_ones(cycle: Cycle) -> None:
     assert failure(queued) == "the gripper was closed before the move request was done"
     with pytest.raises(RequestError, match="the gripper is closed"):
         cycle.submit(RequestKind.RELEASE)
+    cycle.queue.close()
+
+
+def test_a_gripper_that_is_closed_during_a_cycle_ends_the_request_of_the_cycle_once(cycle: Cycle) -> None:
+    grasp = cycle.submit(RequestKind.GRASP)
+    in_flight = cycle.queue.next()
+    cycle.queue.close()
+    cycle.queue.finish_cycle(in_flight, "", replace(STATE, outcome=Outcome.HELD), GraspResult(*RESULT))
+    assert failure(grasp) == "the gripper was closed before the grasp request was done"
+
+
+@pytest.mark.parametrize("kind", list(RequestKind))
+def test_only_a_grasp_or_a_move_that_waits_hides_the_last_outcome(cycle: Cycle, kind: RequestKind) -> None:
+    cycle.stop() if kind == RequestKind.STOP else cycle.submit(kind)
+    assert cycle.queue.is_waiting() == (kind in (RequestKind.GRASP, RequestKind.MOVE))
 
 
 def test_requests_that_nobody_waits_for_are_not_kept(cycle: Cycle) -> None:
@@ -273,7 +290,7 @@ def test_other_requests_are_all_handled(
 
 
 @pytest.mark.parametrize(
-    "value", [True, np.True_, np.array(True), "3", b"3", np.array("3"), None, [1, [2]], 1e10, np.nan]
+    "value", [True, np.True_, np.array(True), "3", b"3", np.array("3"), None, [1, [2]], 1e10, -1e10, np.nan]
 )
 def test_what_is_no_number_is_refused(value: Any) -> None:
     with pytest.raises(RequestError, match=r"a force of .* is not a number of at most 1e"):

@@ -498,6 +498,21 @@ def test_longer_silence_ends_the_run(open_rig: tuple[ExitStack, OpenRig]) -> Non
     assert rig.is_off()
 
 
+def test_jaws_whose_servo_did_not_answer_are_not_opened_at_the_end(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    run, begin = open_rig
+    rig = begin("control.on_fault=open")
+    rig.grip()
+    cycles = rig.session.cycles
+    with pytest.raises(DeviceTimeoutError), run:
+        rig.bus.tamper = lambda _: None
+        try:
+            rig.session.cycle()
+        finally:
+            rig.bus.tamper = None
+    assert rig.session.cycles == cycles
+    assert rig.is_off()
+
+
 def test_bus_retries_are_logged(open_rig: tuple[ExitStack, OpenRig], tmp_path: Path) -> None:
     run, begin = open_rig
     rig = begin()

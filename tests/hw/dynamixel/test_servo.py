@@ -246,18 +246,35 @@ def test_late_failure_of_start_turns_torque_off(memory_endpoint):
     assert firmware.get("torque_enable") == 0
 
 
-def test_register_that_does_not_keep_its_value_is_reported(memory_endpoint):
+@pytest.mark.parametrize(
+    ("forgotten", "instead", "told"),
+    [
+        (REGISTERS["operating_mode"].address, b"\x03", "operating_mode = 5"),
+        (MODEL.indirect_windows(99)[0].address, struct.pack("<21H", *21 * [64]), "its indirect addresses"),
+    ],
+)
+def test_register_that_does_not_keep_its_value_is_reported(memory_endpoint, forgotten, instead, told):
     firmware = memory_endpoint.bus.servos[0]
     real = firmware.write
-
-    def forgetful(address, data):
-        return (
-            real(address, b"\x03") if address == REGISTERS["operating_mode"].address else real(address, data)
-        )
-
-    firmware.write = forgetful
-    with pytest.raises(DeviceError, match="did not keep operating_mode = 5"):
+    firmware.write = lambda address, data: real(address, instead if address == forgotten else data)
+    with pytest.raises(DeviceError, match=f"did not keep {told}"):
         drive(memory_endpoint).start()
+    assert firmware.get("torque_enable") == 0
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_a_start_is_checked_before_torque_comes_on_and_after(memory_endpoint, failing):
+    firmware, torques = memory_endpoint.bus.servos[0], []
+
+    def check(states):
+        torques.append(firmware.get("torque_enable"))
+        if torques[-1] == failing:
+            raise DeviceError("the fingers are apart")
+
+    with pytest.raises(DeviceError, match="apart"):
+        DynamixelBus(memory_endpoint.config(), (1,)).start(check)
+    assert torques == [0, 1][: failing + 1]
+    assert firmware.get("torque_enable") == 0
 
 
 @pytest.mark.parametrize(
