@@ -135,7 +135,9 @@ def test_callers_of_the_same_kind_get_the_same_result(cycle: Cycle) -> None:
 def test_at_fault_only_a_release_is_accepted(cycle: Cycle, kind: RequestKind) -> None:
     cycle.state = replace(STATE, reason="too hot")
     cycle.run(Phase.FAULT, Outcome.FAULT)
-    with pytest.raises(RequestError, match=rf"the {kind} request was refused: stopped or in fault \(too hot\);"):
+    with pytest.raises(
+        RequestError, match=rf"the {kind} request was refused: stopped or in fault \(too hot\);"
+    ):
         cycle.submit(kind)
     cycle.submit(RequestKind.RELEASE)
     cycle.submit(kind)  # the release before it may end the fault

@@ -273,6 +273,18 @@ def test_torque_is_off_after_an_error_in_the_run(
     assert events(tmp_path / "run.mcap")[-1] == f"{type(error).__name__}: {error}"
 
 
+@pytest.mark.parametrize(("error", "torque"), [(DataError("no picture"), 0), (KeyboardInterrupt(), 1)])
+def test_an_exception_ends_the_run_like_a_fault_and_an_interrupt_like_an_exit(
+    open_rig: tuple[ExitStack, OpenRig], error: BaseException, torque: int
+) -> None:
+    run, begin = open_rig
+    rig = begin("on_exit=hold", "control.on_fault=limp")
+    rig.session.cycle()
+    with pytest.raises(type(error)), run:
+        raise error
+    assert rig.register("torque_enable") == torque
+
+
 def test_torque_is_off_after_the_devices_report_a_failure(open_rig: tuple[ExitStack, OpenRig]) -> None:
     run, begin = open_rig
 
@@ -305,6 +317,50 @@ class Gray:
         t_ns = self.asked * 5 * NS_PER_MS
         gray = np.full((2, 2), self.asked % 251, np.uint8)
         return None if self.asked % 4 else Frame(t_ns, t_ns, self.asked // 4, gray)
+
+
+def test_the_jaws_open_although_the_camera_is_lost(
+    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path
+) -> None:
+    run, begin = open_rig
+    camera = Gray()
+    rig = begin("control.on_fault=open", camera=camera)
+    rig.grip()
+
+    def newest() -> Frame:
+        raise DeviceError("the camera is gone")
+
+    camera.newest = newest  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="the camera is gone"), run:
+        rig.session.cycle()
+    last = list(LogReader(tmp_path / "run.mcap").records(GraspStatus))[-1]
+    assert last.width_m > 0.085
+    assert rig.is_off()
+
+
+@dataclasses.dataclass
+class Opening:
+    """A session whose cycles all give the same status."""
+
+    status: GraspStatus
+    opening_s: float = 2.0
+    resolved: ResolvedConfig = dataclasses.field(default_factory=lambda: ResolvedConfig(Config()))
+
+    def cycle(self) -> "Opening":
+        self.status = dataclasses.replace(self.status, t_ns=self.status.t_ns + 5 * NS_PER_MS)
+        return self
+
+
+@pytest.mark.parametrize(
+    ("width_m", "outcome", "waits_s"),
+    [(0.09, Outcome.NONE, 0.0), (0.05, Outcome.BLOCKED, 0.005), (0.05, Outcome.FAULT, 2.5)],
+)
+def test_an_opening_is_waited_for_until_the_jaws_are_open_or_blocked_or_late(
+    width_m: float, outcome: Outcome, waits_s: float
+) -> None:
+    begin = GraspStatus(0, Phase.RELEASE, outcome, 0.0, width_m)
+    last = Session.wait_until_open(Opening(begin), begin)  # type: ignore[arg-type]
+    assert last.t_ns / 1e9 == waits_s
 
 
 class Failing:
@@ -456,13 +512,28 @@ def test_a_servo_that_does_not_start_is_not_stopped_and_leaves_no_log(
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_a_servo_that_can_not_be_stopped_is_told(open_rig: tuple[ExitStack, OpenRig]) -> None:
+@pytest.mark.parametrize(
+    ("first", "raised", "told"),
+    [
+        (None, DeviceError, "no valid reply"),
+        (
+            DataError("no picture"),
+            DataError,
+            "no picture; and the servo could not be stopped: no valid reply",
+        ),
+        (RuntimeError("a bug"), DeviceError, "no valid reply"),
+    ],
+)
+def test_a_servo_that_can_not_be_stopped_is_told(
+    open_rig: tuple[ExitStack, OpenRig], first: Exception | None, raised: type[Exception], told: str
+) -> None:
     run, begin = open_rig
     rig = begin()
     rig.session.cycle()
     rig.bus.tamper = lambda _: None
-    with pytest.raises(DeviceError, match="no valid reply"):
-        run.close()
+    with pytest.raises(raised, match=told), run:
+        if first is not None:
+            raise first
 
 
 @pytest.mark.parametrize("watchdog_ms", [40, 100])
@@ -498,7 +569,9 @@ def test_longer_silence_ends_the_run(open_rig: tuple[ExitStack, OpenRig]) -> Non
     assert rig.is_off()
 
 
-def test_jaws_whose_servo_did_not_answer_are_not_opened_at_the_end(open_rig: tuple[ExitStack, OpenRig]) -> None:
+def test_jaws_whose_servo_did_not_answer_are_not_opened_at_the_end(
+    open_rig: tuple[ExitStack, OpenRig],
+) -> None:
     run, begin = open_rig
     rig = begin("control.on_fault=open")
     rig.grip()
