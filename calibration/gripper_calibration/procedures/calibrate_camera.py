@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
-from itertools import repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -63,7 +62,6 @@ _MAX_SEARCHED: Final = 200
 """Images of the touches that are searched for markers."""
 
 _REFERENCE_FRAMES: Final = 10
-_TIMED_FRAMES: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,7 +341,7 @@ def _capture(config: Config) -> Gray:
 def compute_ms(config: Config, gray: Gray) -> float:
     """Time of one estimate of an image like this one."""
     config, model, _ = resolve_vision(config)
-    return estimate_ms(ResolvedConfig(config, model), repeat(gray, _TIMED_FRAMES))
+    return estimate_ms(ResolvedConfig(config, model), gray)
 
 
 def _shifted(estimate: CalibratedValue, by: float) -> CalibratedValue:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from hashlib import sha256
-from itertools import repeat
 from pathlib import Path
 from typing import Final
 
@@ -42,8 +41,6 @@ from gripper_force.vision.stream_inference import features
 
 TOUCHES: Final = 8
 """Default number of touches: enough for an object of a kind that the network was not trained on."""
-
-_TIMED_FRAMES: Final = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,7 +370,7 @@ def make_profile(
     timed = replace(
         resolved, config=resolved.config.with_values(vision={"region": None})
     )  # the frame is cropped
-    compute_ms = estimate_ms(timed, repeat(frame, _TIMED_FRAMES), engine)
+    compute_ms = estimate_ms(timed, frame, engine)
     profile = ObjectProfile(
         object=name,
         date=datetime.now(UTC).date(),
