@@ -10,8 +10,8 @@ from typing import Final
 
 from gripper_force.errors import DataError
 
-_TRIES: Final = 10
-"""A writer that ends removes the lock file. Another one that has opened it just before opens a new one."""
+_TRIES: Final = 1000
+"""A writer that ends removes the lock file. Others that have opened it just before open a new one."""
 
 
 @contextmanager

@@ -81,6 +81,23 @@ def test_a_killed_writer_locks_nothing(tmp_path: Path) -> None:
     assert names(tmp_path) == ["a.mcap"]
 
 
+def test_a_writer_that_waits_is_not_refused_however_many_end_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock, flock, ended = tmp_path / ".a.yaml.lock", fcntl.flock, list[int]()
+
+    def late(file: int, operation: int) -> None:
+        flock(file, operation)
+        ended.append(file)
+        if len(ended) < 50:
+            lock.unlink()
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with unfinished(tmp_path / "a.yaml", wait=True) as part:
+        part.write_text("whole")
+    assert (names(tmp_path), len(ended)) == (["a.yaml"], 50)
+
+
 @pytest.mark.parametrize("error", [None, BlockingIOError])
 def test_a_writer_that_starts_as_another_ends_is_not_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception] | None
