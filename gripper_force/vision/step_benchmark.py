@@ -106,8 +106,8 @@ def cache_key(model: Model, engine: str, precision: str, threads: int) -> str:
 def read_cache() -> dict[str, EngineCandidate]:
     """Returns the measurements of this machine by `cache_key`; a malformed line of the file is left out."""
     known = {}
-    with suppress(OSError, ValueError):
-        for line in _cache_file().read_text(encoding="utf-8").splitlines():
+    with suppress(OSError):
+        for line in _cache_file().read_text(encoding="utf-8", errors="replace").splitlines():
             with suppress(ValueError, TypeError):
                 key, candidate = json.loads(line)
                 known[key] = EngineCandidate(**candidate)

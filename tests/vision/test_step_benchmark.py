@@ -88,6 +88,14 @@ def test_a_line_that_an_interruption_has_cut_costs_no_other(cache: Path) -> None
     assert read_cache() == {"one": one, "other": one}
 
 
+def test_a_damaged_byte_costs_only_its_line(cache: Path) -> None:
+    """If it cost all lines, each run would measure again, and add its lines to a file that no run can read."""
+    one = EngineCandidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
+    update_cache({"one": one, "two": one})
+    cache.write_bytes(cache.read_bytes().replace(b'["two"', b'["t\xff"}'))
+    assert read_cache() == {"one": one}
+
+
 def test_unwritable_cache_is_ignored(cache: Path) -> None:
     cache.parent.write_text("")
     update_cache({"a": EngineCandidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)})
