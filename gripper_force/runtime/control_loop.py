@@ -26,6 +26,9 @@ _END_S: Final = 25.0
 """Longest wait for the end of the control thread, in addition to the opening of the jaws. A disk that does not answer
 takes 20 s of it."""
 
+_cycles: Final[dict[int, Session]] = {}
+"""Sessions that run a cycle of the caller's thread now, by thread."""
+
 
 class ControlLoop:
     """Runs one session from its opening to its end, in a background thread or in the caller's thread.
@@ -49,7 +52,6 @@ class ControlLoop:
         self._thread: threading.Thread | None = None
         self.owner: Callable[[], object] = lambda: True
         self._cycle_lock = threading.RLock()  # of the thread that runs the cycle with background=False
-        self._in_cycle = False  # the same
         # Written by the thread that runs the control cycle; the first two exist once the loop is open:
         self.session: Session
         self.state: GripperState
@@ -70,6 +72,7 @@ class ControlLoop:
                 run = open_run(resolve(self._config), self._log, port=self._port)
                 self._start(self._resources.enter_context(run))
                 self._resources.enter_context(deferred_signals(self._interrupt))
+                self.session.raise_if_interrupted()  # in the last cycle of the start; a later one may never come
         except BaseException as error:
             self._error, self._error_was_raised = error, True
             self.close(error)
@@ -82,15 +85,17 @@ class ControlLoop:
             self._requests.submit(request)
             if not request.is_awaited:
                 return None
-            while not (self._background or request.result.done()):
-                self.step()
-        try:
-            request.result.exception()  # waits
-        except BaseException:  # an interrupt: jaws that close must not go on; an object that they grip stays
-            with contextlib.suppress(GripperError):
-                if not (request.kind == RequestKind.RELEASE or self.state.phase in GRIPPING):
-                    self.stop()
-            raise
+            try:
+                while not (self._background or request.result.done()):
+                    self.step()
+                request.result.exception()  # waits
+            except (
+                BaseException
+            ):  # an interrupt: jaws that close must not go on; an object that they grip stays
+                with contextlib.suppress(GripperError):
+                    if not (request.kind == RequestKind.RELEASE or self.state.phase in GRIPPING):
+                        self.stop()
+                raise
         self._raise_error()
         return request.result.result()
 
@@ -107,13 +112,14 @@ class ControlLoop:
         if self._background:
             raise RequestError("a background thread runs the control cycle; open with background=False")
         with self._own_cycle():
-            session = self.live_session()
+            session, thread = self.live_session(), threading.get_ident()
             try:
-                self._in_cycle = True
+                _cycles[thread] = session
                 self._cycle(session)
-                self._in_cycle = False
+                del _cycles[thread]
                 session.raise_if_interrupted()  # a later cycle may never come
             except BaseException as error:
+                _cycles.pop(thread, None)
                 self._error, self._error_was_raised = error, True
                 raise
             return self.state
@@ -166,10 +172,8 @@ class ControlLoop:
             with self._cycle_lock:  # a cycle of another thread, which is its last one, uses the devices
                 # An error of an earlier step ends the run as a fault even if the caller has handled it.
                 cause = self._error if error is None else error
-                if cause is None:
-                    self._resources.close()
-                else:
-                    self._resources.__exit__(type(cause), cause, cause.__traceback__)
+                raised = (None, None, None) if cause is None else (type(cause), cause, cause.__traceback__)
+                self._resources.__exit__(*raised)
             return
         with self._resources:
             trace = None if error is None else error.__traceback__
@@ -192,10 +196,10 @@ class ControlLoop:
             self._resources.close()
 
     def _interrupt(self) -> None:
-        """Interrupts the program's own code at once, but a cycle of the caller's thread at its end."""
-        if not self._in_cycle or self._error is not None:
+        """Interrupts the program's own code at once, but a cycle in this thread, of any gripper, at its end."""
+        if (session := _cycles.get(threading.get_ident())) is None:
             raise KeyboardInterrupt
-        self.session.interrupt()
+        session.interrupt()
 
     def _own_cycle(self) -> contextlib.ExitStack:
         """Lets only this thread run the control cycle: a second one would use the servo's port at the same time."""
@@ -264,8 +268,7 @@ class ControlLoop:
     # The control cycle.
 
     def _start(self, session: Session) -> None:
-        decision = session.wait_for_reference()
-        self._publish(session, decision)
+        self._publish(session, session.wait_for_reference())
         self.session = session
         self._opened.set()
 

@@ -78,8 +78,7 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
         is_whole = given.shape == (4,) and given.dtype.kind in "iu"
         left, top, width, height = given.tolist() if is_whole else (-1, 0, 0, 0)
         rows, columns = gray.shape
-        inside = 0 <= left < left + width <= columns and 0 <= top < top + height <= rows
-        if not inside:
+        if not (0 <= left < left + width <= columns and 0 <= top < top + height <= rows):
             raise ConfigError(
                 f"vision.region {given.tolist()} (left, top, width, height in whole pixels) must lie within "
                 f"the camera's frame of {columns}x{rows} pixels"

@@ -1270,6 +1270,56 @@ def test_a_signal_in_the_last_cycle_is_raised_at_its_end(
     assert [state.phase for state in cycles] == [gf.Phase.OPEN]
 
 
+@pytest.mark.usefixtures("own_process")
+def test_a_signal_does_not_break_the_cycle_of_a_gripper_that_is_not_the_newest(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gripper, _newest = simulated(), simulated("servo.port=virtual:second")
+    cycle, ended = ControlLoop._cycle, list[bool]()
+
+    def with_signal(loop: ControlLoop, session: Session) -> None:
+        cycle(loop, session)
+        signal.raise_signal(signal.SIGTERM)
+        ended.append(True)
+
+    monkeypatch.setattr(ControlLoop, "_cycle", with_signal)
+    with pytest.raises(KeyboardInterrupt):
+        gripper.step()
+    assert ended == [True]
+
+
+@pytest.mark.usefixtures("own_process")
+def test_a_signal_between_the_cycles_of_a_call_stops_jaws_that_close(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gripper, step = simulated(), ControlLoop.step
+
+    def with_signal(loop: ControlLoop) -> gf.GripperState:
+        if step(loop).phase == gf.Phase.APPROACH:
+            signal.raise_signal(signal.SIGTERM)
+        return loop.state
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(ControlLoop, "step", with_signal)
+        gripper.grasp(2.0)
+    assert gripper.step().phase == gf.Phase.FAULT
+
+
+@pytest.mark.usefixtures("own_process")
+def test_a_signal_in_the_last_cycle_of_the_start_ends_it(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = ControlLoop._start
+
+    def with_signal(loop: ControlLoop, session: Session) -> None:
+        start(loop, session)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(ControlLoop, "_start", with_signal)
+    with pytest.raises(KeyboardInterrupt):
+        simulated()
+
+
 @pytest.mark.parametrize(("number", "background"), [(signal.SIGINT, True), (signal.SIGTERM, False)])
 def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(
     quick: list[str], server: PtyServer, number: signal.Signals, background: bool
