@@ -89,7 +89,7 @@ def file(
     """Print a file that comes with the package: an example, the udev rules, or the layout for Foxglove."""
     files = shipped_files()
     if name is None:
-        console.show({key: str(path) for key, path in files.items()}, as_json)
+        console.show({key: str(path) for key, path in files.items()}, as_json, console.pairs)
     elif name not in files:
         raise ConfigError(f"no file {name!r} comes with gripper-force; use one of: {', '.join(files)}")
     elif as_json:

@@ -887,6 +887,11 @@ def test_a_command_that_uses_no_configuration_says_so(run: Run, words: list[str]
     assert "Not allowed" in run(*words, "--help").out
 
 
+def test_files_are_listed_by_the_names_that_print_them(run: Run) -> None:
+    listed = {line.split()[0] for line in run("config", "file").out.splitlines()}
+    assert listed >= json.loads(run("config", "file", "--json").out).keys()
+
+
 def test_options_without_effect_are_refused(run: Run) -> None:
     for words, name in ((["--same-object"], "--same-object"), (["--jobs", 1], "--jobs")):
         done = run("grasp", *words)
