@@ -43,6 +43,7 @@ def test_jaws_that_slide_in_a_hold_have_lost_their_object(press, transmission):
     motor_force_n = transmission.friction_n
     press(3.0 + motor_force_n)
     assert press(motor_force_n, holding=True).force_n > 2 * motor_force_n - 0.01
+    assert press(motor_force_n, closing_m_s=0.02).force_n > 2 * motor_force_n - 0.01
     assert press(motor_force_n, holding=True, closing_m_s=0.02).force_n == pytest.approx(0.0, abs=0.01)
 
 
@@ -77,8 +78,18 @@ def test_free_travel_shows_friction_until_the_next_grasp(press, transmission):
     current.restart()
     assert (current.friction_n, current.friction_variance_n2) == (nominal_n, nominal_n2)
     assert current.free_travel.mean_n is None
-    current.take_friction(-0.1)
-    assert current.friction_n == 0.0
+    for taken_n, kept_n in ((0.7, 0.7), (-0.1, 0.0)):
+        current.take_friction(taken_n)
+        assert current.friction_n == kept_n
+
+
+def test_a_reading_from_the_past_changes_nothing(transmission):
+    current = CurrentEstimate(ControlConfig(), transmission)
+    for t_ns, current_a in ((10 * CYCLE_NS, 0.1), (0, 0.3)):
+        servo = ServoState(t_ns, 0.0, 0.0, current_a, 30.0, 12.0, 0)
+        current.step(servo, free=False, holding=False, lowering=False)
+    assert current.dt_s == 0.0
+    assert current.force_n == pytest.approx(transmission.force_n(0.1, 0.0) - transmission.friction_n)
 
 
 def test_no_friction_leaves_no_play(transmission):

@@ -219,6 +219,32 @@ def test_a_grasp_that_begins_in_contact_keeps_a_small_force_limit(make_run, limi
     assert 0.0 < run.plant.peak_n <= 1.05 * limit_n
 
 
+@pytest.mark.parametrize(
+    ("phase", "speed_m_s"),
+    [
+        ("approach", 0.025),
+        ("contact", 0.97 * 0.025),
+        ("ramp", 0.97 * 0.025),
+        ("hold", 0.5 * 0.025),
+        ("release", 2 * 0.025),
+        ("move", 2 * 0.025),
+    ],
+)
+def test_jaws_that_nothing_resists_have_the_lead_of_the_speed_of_their_phase(make_run, phase, speed_m_s):
+    if phase in ("release", "move"):
+        run = make_run(plant={"x_m": 0.02, "friction_n": 100.0}).go(0.5, phase, width_m=0.02)
+    else:
+        run = make_run().to_phase(phase).go(0.05)
+    run.spoil = lambda _, servo: replace(servo, velocity_rad_s=0.0, current_a=0.0)
+    run.go(0.005)
+    assert run.last.status.phase == phase
+    _, servo, *_ = run.inputs[-1]
+    lead_m = abs(run.last.command.goal_position_rad - servo.position_rad) * run.transmission.jaw_m_per_rad(
+        0.0
+    )
+    assert lead_m * POSITION_LOOP.gain_per_s == pytest.approx(1.3 * speed_m_s)
+
+
 def test_a_release_after_a_stop_lets_a_springy_object_go_slowly(make_run):
     run = make_run(plant={"stiffness_n_m": 970.0, "mass_kg": 0.83}, on_fault="hold").grasp(6.9)
     run.go(0.5, "stop").go(2.0, "release")

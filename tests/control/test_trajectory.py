@@ -16,6 +16,8 @@ def test_arrives_without_overshoot_within_rate(start, target, rate, dt_s):
         assert low <= after <= high
         assert abs(after - before) <= rate * dt_s * (1 + 1e-9)
         assert abs(target - after) <= abs(target - before)
+        # It can still come to rest at its target.
+        assert profile.speed**2 <= 2 * rate / 0.4 * abs(target - before) * (1 + 1e-9)
     assert profile.value == target
 
 

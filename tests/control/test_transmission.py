@@ -48,3 +48,18 @@ def test_calibration_reduces_uncertainty():
     gripper = Transmission.from_config(GripperConfig(friction_std=0.1, gain_std=0.02), 1.78)
     assert gripper.bias_std_n(0.0) == pytest.approx(0.1 * gripper.friction_n)
     assert gripper.bias_std_n(1e3) == pytest.approx(0.02 * 1e3, rel=1e-3)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_goals_go_from_the_open_jaws_to_10_mm_of_each_jaw_beyond_the_closed_ones(sign):
+    gripper = Transmission.from_config(GripperConfig(closing_sign=sign), 1.78)
+    assert gripper.goal_range_rad == tuple(sorted(gripper.goal_range_rad))
+    widths_m = sorted(gripper.width_m(position_rad) for position_rad in gripper.goal_range_rad)
+    assert widths_m == pytest.approx([-0.02, gripper.open_width_m])
+
+
+@pytest.mark.parametrize(("radius_m", "speed_m_s"), [(0.02, 0.0036), (0.01, 0.0018)])
+def test_the_speed_of_an_impact_grows_with_its_force(radius_m, speed_m_s):
+    gripper = Transmission.from_config(GripperConfig(pinion_radius_m=radius_m), 1.78)
+    assert gripper.impact_m_s(1.0) == pytest.approx(speed_m_s)
+    assert gripper.impact_m_s(3.0) == pytest.approx(3 * speed_m_s)
