@@ -654,6 +654,14 @@ def test_at_fault_the_jaws_open(make_run, phase):
     assert run.last.status.phase == "fault"
 
 
+def test_at_fault_the_jaws_open_against_friction_that_has_grown(make_run):
+    run = make_run(on_fault="open").grasp(2.0, 3.0)
+    run.plant.friction_n *= 5.0
+    run.go(4.0, "stop")
+    assert run.last.status.phase == "fault"
+    assert run.plant.x_m < 0.003
+
+
 def test_a_result_says_that_a_hot_servo_holds_less(make_run):
     run = make_run()
     run.spoil = lambda _, servo: replace(servo, temperature_c=65.0)
