@@ -10,8 +10,10 @@ _RISE_SHARE = 0.15
 """The filtered visual estimate must have risen by at least this share of the target since the jaws stopped."""
 
 _NOISE_SHARE = 0.25
-"""Until the grip counts as held, it must also have risen by its standard deviation, up to this share of the target:
-noise alone reaches the share of a small target. Unfamiliar frames have no standard deviation."""
+"""If it was above the target before the contact, the camera sees forces that are not there, and noise alone reaches the
+share of a small target. Until such a grip counts as held, it must also rise by its standard deviation, up to this share
+of the target. Unfamiliar frames have no standard deviation. (A light grip of a rigid object may rise as little as its
+noise: the impact gives it most of its force.)"""
 
 _BEYOND_SHARE = 1.0
 _BEYOND_N = 1.5
@@ -104,7 +106,8 @@ class VisualCheck:
         if self._force_n is None:
             return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
-        noise_n = 0.0 if is_held else min(self._std_n, _NOISE_SHARE * target_n)
+        is_doubtful = self._before_n > target_n and not is_held
+        noise_n = min(self._std_n, _NOISE_SHARE * target_n) if is_doubtful else 0.0
         has_risen = self._force_n - self._before_n >= _RISE_SHARE * target_n + noise_n
         if has_risen and not (by_friction and self._force_n - target_n > beyond_n):
             return ""

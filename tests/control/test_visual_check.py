@@ -40,16 +40,19 @@ def test_a_force_that_does_not_rise_is_an_objection(before_n, std_n):
 
 
 @pytest.mark.parametrize(
-    ("rise_n", "target_n", "std_n", "objects"),
+    ("before_n", "rise_n", "target_n", "std_n", "objects"),
     [
-        (0.3, 1.0, 0.2, True),
-        (0.4, 1.0, 0.2, False),
-        (0.2, 0.4, 0.4, False),  # a small target may be within the noise
-        (0.3, 1.0, math.inf, False),  # the noise of unfamiliar frames is not known
+        (3.0, 0.3, 1.0, 0.2, True),
+        (3.0, 0.4, 1.0, 0.2, False),
+        (3.0, 0.2, 0.4, 0.4, False),  # a small target may be within the noise
+        (3.0, 0.3, 1.0, math.inf, False),  # the noise of unfamiliar frames is not known
+        (0.7, 0.3, 1.0, 0.2, False),  # an impact may have given this force
     ],
 )
-def test_a_rise_within_the_noise_confirms_only_a_grip_that_was_held(rise_n, target_n, std_n, objects):
-    check, _ = seen(3.0 + rise_n, before_n=3.0, std_n=std_n)
+def test_forces_above_the_target_before_the_contact_make_noise_count_until_the_grip_is_held(
+    before_n, rise_n, target_n, std_n, objects
+):
+    check, _ = seen(before_n + rise_n, before_n, std_n)
     assert bool(check.objection(target_n, 4.0)) == objects
     assert not check.objection(target_n, 4.0, is_held=True)
 
