@@ -335,6 +335,24 @@ def test_unfamiliar_frames_tell_a_grip_from_empty_jaws_on_an_end_stop(make_run, 
     assert {decision.estimate.source for decision in run.decisions} == {"current"}
 
 
+@pytest.mark.parametrize(("std_n", "outcome"), [(1.4, ""), (math.inf, "held")])
+def test_a_rise_within_the_noise_of_the_camera_begins_no_held_but_does_not_end_it(make_run, std_n, outcome):
+    """The camera sees forces that are not there, more than the target before the contact."""
+    run = make_run(vision={"noise_n": 0.0}, timeout_s=20.0)
+    sample = run.vision.sample
+
+    def weak(t_ns, force_n, noise):
+        visual = sample(t_ns, 2.5 + 0.35 * force_n, noise)
+        return None if visual is None else replace(visual, std_n=std_n)
+
+    run.vision.sample = weak
+    run.grasp(2.0)
+    assert run.last.status.outcome == outcome
+    std_n = 1.4
+    run.go(2.0)
+    assert run.last.status.outcome == outcome
+
+
 def test_camera_that_is_uncertain_throughout_a_grip_prevents_held(make_run):
     run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0)
     assert run.last.status.outcome == "timeout"
