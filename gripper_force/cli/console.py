@@ -116,12 +116,24 @@ def warn(text: str) -> None:
 
 def command(*words: object) -> str:
     """Returns a command of gripper-force as a shell takes it, by its words."""
-    return shlex.join(map(str, ("gripper-force", *words)))
+    return _as_typed("gripper-force", *words)
+
+
+def _as_typed(*words: object) -> str:
+    """Returns a command as a shell takes it. A path that begins with a dash would be an option, so it gets ``./``."""
+    return shlex.join(
+        f"./{word}" if isinstance(word, Path) and f"{word}".startswith("-") else str(word) for word in words
+    )
 
 
 def next_step(*words: object) -> None:
     """Prints the step that usually follows, as the last line: a command of gripper-force by its words."""
     err.print(f"next: {command(*words)}", soft_wrap=True, markup=False)
+
+
+def next_page(page: Path) -> None:
+    """Prints as the last line that this page is to be opened."""
+    err.print(f"next: {_as_typed('open', page)}", soft_wrap=True, markup=False)
 
 
 def tell_kept(what: str, *, fresh: bool) -> None:

@@ -150,7 +150,7 @@ def _grasp_once(settings: "Config", view: str | None, as_json: bool) -> None:
     if result["report"] is None:
         console.next_step("replay", log, "--report")
     else:
-        console.err.print(f"next: open {result['report']}", soft_wrap=True, markup=False)
+        console.next_page(Path(result["report"]))
     if result["result"] != "held":
         raise typer.Exit(1)
 
@@ -299,7 +299,7 @@ def replay(
     if set_ or checkpoint:
         console.err.print(_OPEN_LOOP, soft_wrap=True)
     if pages:
-        console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
+        console.next_page(Path(pages[0]))
     elif len(replays.results) == 1 and not unreported:
         console.next_step(
             "replay", *logs, *_changes(checkpoint, set_), *(["--recover"] if recover else ()), "--report"

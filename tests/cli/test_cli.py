@@ -1153,3 +1153,12 @@ def test_a_summary_names_a_file_whose_name_is_no_text(run: Run, current_log: Pat
     assert done.code == 0, done.err
     assert "a\\udcff.mcap" in Path("out/summary.html").read_text()
     assert "a\\udcff.mcap" in Path("out/summary.csv").read_text()
+
+
+def test_the_next_step_can_be_copied_for_every_path(capsys: pytest.CaptureFixture[str]) -> None:
+    console.next_step("train", Path("-my logs"), "--out", "a.safetensors")
+    console.next_page(Path("-my logs/run.html"))
+    assert capsys.readouterr().err.splitlines() == [
+        "next: gripper-force train './-my logs' --out a.safetensors",
+        "next: open './-my logs/run.html'",
+    ]

@@ -20,6 +20,9 @@ TARE_SPREAD_N: Final = 0.05
 TARE_RISE_N: Final = 1.0
 """Smallest later rise of the force, and largest later fall, that a tare needs."""
 
+_MAX_T_S: Final = 4e9
+"""Largest time, over 100 years: beyond it the unit is none of seconds, and from 9.2e9 s on a log can't hold it."""
+
 Floats = npt.NDArray[np.float64]
 
 
@@ -43,7 +46,7 @@ def read_forces(path: Path) -> ForceTable:
 
     Raises:
         DataError: The table is missing or empty, lacks a column, or has a value that is not a finite number,
-            a repeated frame, or rows out of order. The message names the line.
+            a time of more than 100 years, a repeated frame, or rows out of order. The message names the line.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -86,6 +89,8 @@ def _number(path: Path, line: int, column: str, text: str | None) -> float:
     if not math.isfinite(value) or (column == "frame" and not whole):
         kind = "frame number" if column == "frame" else "finite number"
         raise DataError(f"{path}, line {line}: {column} is {text!r} and not a {kind}; correct the line")
+    if column == "t_s" and abs(value) > _MAX_T_S:
+        raise DataError(f"{path}, line {line}: t_s is {text!r}, more than 100 years; write the times in seconds")
     return value
 
 
