@@ -72,7 +72,7 @@ def bias(predicted: Signal, measured: Signal) -> float:
 def per_bin(predicted_n: Signal, measured_n: Signal, width_n: float = 1.0) -> list[ForceBin]:
     """Errors by measured force, in bins of ``width_n``, by rising force and without empty bins."""
     error = _error(predicted_n, measured_n)
-    index = np.floor(np.asarray(measured_n, np.float64) / width_n).astype(int)
+    index = np.floor(np.asarray(measured_n, np.float64) / width_n)
     bins = []
     for i in np.unique(index):
         part = error[index == i]

@@ -23,6 +23,12 @@ def test_bins_use_measured_force() -> None:
     assert wide.frames == 4
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_force_beyond_every_integer_has_its_bin() -> None:
+    (one,) = metrics.per_bin([0.0], [1e30])
+    assert (one.from_n, one.frames) == (1e30, 1)
+
+
 @pytest.mark.parametrize(("predicted", "measured"), [([], []), ([1.0], [1.0, 2.0]), ([[1.0]], [[1.0]])])
 def test_series_must_match(predicted: list[float], measured: list[float]) -> None:
     with pytest.raises(ValueError, match="one length"):
