@@ -279,6 +279,10 @@ def evaluate(
             progress=progress,
         )
     _warn_left_out(result.left_out, len(logs))
+    if result.other_rig:
+        console.warn(
+            f"the network learned from one rig only, and logs are of another: {'; '.join(result.other_rig)}"
+        )
     console.show(result, as_json, errors_table)
     if plot is not None:
         console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)
@@ -307,7 +311,7 @@ def export_network(
 ) -> None:
     """Export a network to ONNX or OpenVINO, and compare it with PyTorch."""
     from gripper_force.jobs.dataset import find_logs, load_clips
-    from gripper_force.jobs.int8_export import export_int8
+    from gripper_force.jobs.int8_export import check_int8_name, export_int8
     from gripper_force.vision.export import export as job
     from gripper_force.vision.header import EXPORTED
     from gripper_force.vision.model_files import read_model
@@ -315,6 +319,7 @@ def export_network(
     model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
     frames = None
     if int8 is not None:
+        check_int8_name(out)
         logs = find_logs(int8)
         with console.bar("reading logs", len(logs)) as progress:
             clips = load_clips(logs, model.header.preprocess, workers=jobs, progress=progress)

@@ -71,6 +71,7 @@ class Evaluation:
         left_out: Logs that were left out because they start in contact.
         per_log: Errors by path of the log; empty for clips.
         failed: Problem of each log that could not be evaluated, by path.
+        other_rig: Settings of camera and gripper in which logs differ from the one rig that the network learned from.
     """
 
     mae_n: float
@@ -83,6 +84,7 @@ class Evaluation:
     left_out: int = 0
     per_log: dict[str, ObjectErrors] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
+    other_rig: list[str] = field(default_factory=list)
 
 
 def evaluate(
@@ -169,6 +171,7 @@ def evaluate(
         left_out=len(chosen) - len(clips),
         per_log={str(path): _log_errors(clip, estimates_n, lead_in) for path, clip, estimates_n in used},
         failed={str(paths[number]): str(error) for number, error in failed.items()},
+        other_rig=sorted({text for log in chosen.values() for text in log.other_rig}),
     )
     if folder is not None:
         columns = [_columns(*log) for log in used]
@@ -210,10 +213,11 @@ def _columns(path: Path, clip: Clip, forces_n: npt.NDArray[np.floating]) -> dict
 
 @dataclass(frozen=True, eq=False)
 class _Evaluated:
-    """A recording without its images, and the estimates; None if it starts in contact."""
+    """A recording without its images, the estimates (None if it starts in contact), and how its rig differs."""
 
     clip: Clip
     forces_n: npt.NDArray[np.floating] | None
+    other_rig: Sequence[str] = ()
 
 
 def _evaluate_log(
@@ -253,7 +257,12 @@ def _evaluate_log(
     clip = streamed.clip(streamed.no_images)
     if starts_in_contact(clip.forces_n, preprocess) and not include_contact_starts:
         return _Evaluated(clip, None)
-    return _Evaluated(clip, (1.0 if gain is None else gain.gain) * forces_n)
+    region = settings.vision.region or logged.vision.region
+    rig = logged.with_values(vision={"region": region}).rig_settings()
+    # A profile is of its own rig, and the rig of an imported recording is not known.
+    known = correction is None and logged.gripper.nm_per_a is not None
+    differs = loaded.header.mismatches(rig) if known else ()
+    return _Evaluated(clip, (1.0 if gain is None else gain.gain) * forces_n, differs)
 
 
 def errors_on(

@@ -49,8 +49,7 @@ def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportError
         CheckpointError: The checkpoint can't be read, the file can't be written, or its estimates are not finite.
         DataError: The recordings hold too few frames.
     """
-    if path.suffix != ".xml":
-        raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
+    check_int8_name(path)
     frames = [
         clip for clip in frames if len(clip) > model.header.preprocess.lead_in
     ]  # others give no estimate
@@ -65,6 +64,12 @@ def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportError
         errors = export_errors(model, made, held_out)
         _replace_header(with_added_error(model.header, errors), made)
     return errors
+
+
+def check_int8_name(path: Path) -> None:
+    """Raises `ConfigError` if an int8 network can't be exported to this file, before logs are read for it."""
+    if path.suffix != ".xml":
+        raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
 
 
 def _split(frames: Sequence[Gray], reference_frames: int) -> tuple[list[Gray], list[Gray]]:

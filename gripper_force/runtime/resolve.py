@@ -34,8 +34,8 @@ _MIN_TRAVEL_RAD = 0.3
 """Smallest plausible rotation of the horn for the whole travel of a rack. With less, the pinion's radius is wrong."""
 
 _NO_SCORE = (
-    "the network has no out-of-distribution score, so unfamiliar objects are not noticed; bfloat16 and int8 have none, "
-    "and `gripper-force calibrate network` fits that of other networks"
+    "the network has no out-of-distribution score, so unfamiliar objects are not noticed; bfloat16, int8 and Gaussian "
+    "processes have none, and `gripper-force calibrate network` fits that of other networks"
 )
 
 _CYCLES_PER_WATCHDOG = 2

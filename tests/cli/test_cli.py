@@ -559,6 +559,12 @@ def test_an_export_states_its_error_and_the_next_step(
     assert done.err.splitlines()[-1] == f"next: gripper-force grasp {options}"
 
 
+def test_an_int8_export_to_another_format_ends_before_logs_are_read(run: Run, tiny_checkpoint: Path) -> None:
+    Path("cut.mcap").write_bytes(b"")
+    done = run("export", "network", tiny_checkpoint, "--out", "force.onnx", "--int8", "cut.mcap")
+    assert (done.code, "int8 is exported to OpenVINO only" in done.err) == (2, True)
+
+
 def test_with_json_the_error_is_json_too(run: Run) -> None:
     done = run("grasp", "--json", "--set", "[bold]=3")
     assert done.code == 2

@@ -8,15 +8,16 @@ import torch
 from typer.testing import CliRunner
 
 from gripper_force import cli, plugins
-from gripper_force.config import Config, load_config
+from gripper_force.config import Config, config_from_text, dump_config, load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, load_clips
 from gripper_force.jobs.estimates import estimate_clips
 from gripper_force.jobs.evaluate import Evaluation, errors_on, evaluate
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import LoadCellSample
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.checkpoint_writer import save_checkpoint
+from gripper_force.vision.checkpoint_writer import replace_header, save_checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import Header, NetworkConfig, Residual
@@ -151,6 +152,27 @@ def test_logs_that_start_in_contact_are_left_out(
     included = CliRunner().invoke(cli.app, [*call, "--include-contact-starts", "--json"])
     assert "left out" not in included.stderr
     assert json.loads(included.stdout)["frames"] == every.frames
+
+
+def test_logs_of_another_rig_than_that_of_the_network_are_told(
+    few_logs: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    network = tmp_path / "one_rig.safetensors"
+    rig = {"rigs": 1, "vision.region": [0, 0, 10, 10]}
+    header = read_model(tiny_checkpoint).header.model_copy(update={"trained_on": rig})
+    replace_header(tiny_checkpoint, header, network)
+    reader = LogReader(min(few_logs.iterdir()))
+    config = config_from_text(reader.config, "").with_values(gripper={"nm_per_a": 1.0})
+    assert evaluate(few_logs, network).other_rig == [], "the rig of imported recordings is not known"
+    with LogWriter(few_logs / "run.mcap", config=dump_config(config), metadata={}) as log:
+        for record in reader.records():
+            log.write(record)
+    call = ["evaluate", str(few_logs), "--checkpoint", str(network), "--jobs", "1", "--json"]
+    done = CliRunner().invoke(cli.app, call)
+    assert json.loads(done.stdout)["other_rig"] == ["vision.region [0, 0, 10, 10], not None"]
+    assert "learned from one rig only, and logs are of another: vision.region" in done.stderr
+    same = Config().with_values(vision={"region": (0, 0, 10, 10)})
+    assert evaluate(few_logs, network, config=same).other_rig == []
 
 
 def test_estimates_are_drawn(few_logs: Path, tiny_checkpoint: Path, tmp_path: Path) -> None:

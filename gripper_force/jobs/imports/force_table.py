@@ -90,7 +90,9 @@ def _number(path: Path, line: int, column: str, text: str | None) -> float:
         kind = "frame number" if column == "frame" else "finite number"
         raise DataError(f"{path}, line {line}: {column} is {text!r} and not a {kind}; correct the line")
     if column == "t_s" and abs(value) > _MAX_T_S:
-        raise DataError(f"{path}, line {line}: t_s is {text!r}, more than 100 years; write the times in seconds")
+        raise DataError(
+            f"{path}, line {line}: t_s is {text!r}, more than 100 years; write the times in seconds"
+        )
     return value
 
 

@@ -168,9 +168,10 @@ def calibrate_network(
     """
     check_place(out)
     checkpoint = load_checkpoint(source)
+    networks = checkpoint.force_networks  # raises for a Gaussian process, before the logs are read
     preprocess = checkpoint.header.preprocess
     clips = without_contact_starts(load_clips(logs, preprocess, None, workers, progress), preprocess)
-    model = fit_ood(checkpoint.force_networks, checkpoint.header, clips, progress=progress)
+    model = fit_ood(networks, checkpoint.header, clips, progress=progress)
     if model is None:
         raise DataError(
             f"a score needs at least {MIN_LOGS} logs that show contact and were not trained on, of at least {FOLDS} "

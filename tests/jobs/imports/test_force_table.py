@@ -25,7 +25,10 @@ GRIP_N = np.interp(np.arange(60), [0, 15, 30, 45, 50, 60], [0, 0, 20, 20, 0, 0])
         ("frame,t_s,force_n\n0,0\n", "line 2: force_n is None"),
         ("frame,t_s,force_n\n0.5,0,1\n", "line 2: frame is '0.5' and not a frame number"),
         ("frame,t_s,force_n\n1e19,0,1\n", "line 2: frame is '1e19' and not a frame number"),
-        ("frame,t_s,force_n\n0,1.7e18,1\n", "line 2: t_s is '1.7e18', more than 100 years; write the times in"),
+        (
+            "frame,t_s,force_n\n0,1.7e18,1\n",
+            "line 2: t_s is '1.7e18', more than 100 years; write the times in",
+        ),
         ("frame,t_s,force_n\n0,0,1\n0,0.03,1\n", "frame 0 at 0.0300 s follows frame 0 at"),
         ("frame,t_s,force_n\n0,0.03,1\n1,0,1\n", "frame 1 at 0.0000 s follows frame 0 at 0.0300 s"),
         ("\0\xff", "lacks the column"),

@@ -14,6 +14,7 @@ from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.imports.video import import_folder
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training import train as train_module
+from gripper_force.jobs.training.ood_fit import calibrate_network
 from gripper_force.jobs.training.recipe import TrainConfig, recipe
 from gripper_force.jobs.training.stated_errors import errors, labelled_estimates
 from gripper_force.jobs.training.train import train
@@ -163,6 +164,11 @@ def test_keys_of_networks_are_refused(
         train(config, six, out, replay_clips=six)
     with pytest.raises(ConfigError, match="is a Gaussian process"):
         train(small_recipe, six, out, init=load_checkpoint(process))
+
+
+def test_a_process_gets_no_score_and_no_log_is_read_for_it(process: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is a Gaussian process"):
+        calibrate_network([tmp_path / "none.mcap"], tmp_path / "out.safetensors", process)
 
 
 def test_a_network_of_the_recipe_few_can_be_evaluated(few_logs: Path, tmp_path: Path) -> None:
