@@ -106,8 +106,7 @@ class VisualCheck:
         if self._force_n is None:
             return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
-        is_doubtful = self._before_n > target_n and not is_held
-        noise_n = min(self._std_n, _NOISE_SHARE * target_n) if is_doubtful else 0.0
+        noise_n = 0.0 if is_held or self._before_n <= target_n else min(self._std_n, _NOISE_SHARE * target_n)
         has_risen = self._force_n - self._before_n >= _RISE_SHARE * target_n + noise_n
         if has_risen and not (by_friction and self._force_n - target_n > beyond_n):
             return ""

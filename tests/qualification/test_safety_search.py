@@ -148,7 +148,7 @@ def test_a_missing_speed_limit_is_found(config: Config, monkeypatch: pytest.Monk
 
 
 def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(VisualCheck, "objection", lambda *_: "")
+    monkeypatch.setattr(VisualCheck, "objection", lambda *_, **__: "")
     wrong = [
         i
         for i in range(1000)

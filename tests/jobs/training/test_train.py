@@ -226,7 +226,7 @@ def test_command_tells_what_to_do_next(
     assert "add --resume" in CliRunner().invoke(cli.app, [*call, "--resume"]).stderr
     done = CliRunner().invoke(cli.app, [*call, "--resume"])
     assert done.exit_code == 0
-    assert "constant_mae_n" in done.stdout
+    assert "constant MAE, N" in done.stdout
     assert f"next: gripper-force evaluate FOLDER --checkpoint {out}" in done.stderr
     short = CliRunner().invoke(cli.app, [*call, "--set", "steps=1", "--json"])
     too_short, no_score = json.loads(short.stdout)["warnings"]
