@@ -8,6 +8,7 @@ opened, or an error says why not.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, Final
@@ -16,6 +17,7 @@ from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Clock, Devices, SharedPort
 from gripper_force.plugins import load_class
+from gripper_force.runtime.process import keep_in_forks
 from gripper_force.types import NS_PER_S
 
 RIG: Final = "gripper_hw.sim.simulated_rig:SimulatedRig"
@@ -143,9 +145,10 @@ def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Dev
         load_cell = _open_sensor(stack, "load_cell", config, rig, clock)
         shared = () if port is None else (port,)
         servo = load_servo_class(config)(config.servo, clock.now_ns, *shared)
-        stack.callback(servo.close)
+        stack.callback(_close, servo)
         if rig is not None:
             rig.start()
+        keep_in_forks(stack)
         yield Devices(
             clock=clock,
             servo=servo,
@@ -176,5 +179,13 @@ def _open_sensor(stack: ExitStack, unit: str, config: Config, rig: Any, clock: C
         return None
     simulated = section.backend == "simulated"
     device = getattr(rig, unit) if simulated else _sensor_class(config, unit)(section, clock)
-    stack.callback(device.close)
+    stack.callback(_close, device)
     return device
+
+
+def _close(device: Any) -> None:
+    """Closes a device. An error of it only warns, because it would hide the result or the error of the run."""
+    try:
+        device.close()
+    except Exception as error:
+        warnings.warn(f"a device was not closed: {error}", RuntimeWarning, stacklevel=2)

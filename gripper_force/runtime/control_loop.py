@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import os
 import sys
 import threading
 from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -26,8 +28,8 @@ _END_S: Final = 25.0
 """Longest wait for the end of the control thread, in addition to the opening of the jaws. A disk that does not answer
 takes 20 s of it."""
 
-_cycles: Final[dict[int, Session]] = {}
-"""Sessions that run a cycle of the caller's thread now, by thread."""
+_cycles: Final[ContextVar[tuple[ControlLoop, ...]]] = ContextVar("_cycles", default=())
+"""Loops of which this thread runs a cycle now: several, if a device of one gripper steps another one."""
 
 
 class ControlLoop:
@@ -46,6 +48,7 @@ class ControlLoop:
         self, config: Config, log: Path | None, *, background: bool, port: SharedPort | None = None
     ) -> None:
         self._config, self._log, self._port = config, log, port
+        self._process = os.getpid()
         self._background = background
         self._requests, self._tracker = RequestQueue(), StateTracker()
         self._resources = contextlib.ExitStack()  # of the caller's thread
@@ -112,16 +115,20 @@ class ControlLoop:
         if self._background:
             raise RequestError("a background thread runs the control cycle; open with background=False")
         with self._own_cycle():
-            session, thread = self.live_session(), threading.get_ident()
+            session = self.live_session()
             try:
-                _cycles[thread] = session
-                self._cycle(session)
-                del _cycles[thread]
+                token = _cycles.set((*_cycles.get(), self))
+                try:
+                    self._cycle(session)
+                finally:
+                    _cycles.reset(token)
                 session.raise_if_interrupted()  # a later cycle may never come
             except BaseException as error:
-                _cycles.pop(thread, None)
                 self._error, self._error_was_raised = error, True
                 raise
+            finally:
+                if self._closing.is_set() and not self._ended.is_set():  # a device closed it in this cycle
+                    self.close(self._end_error)
             return self.state
 
     def shown_state(self) -> GripperState:
@@ -161,10 +168,17 @@ class ControlLoop:
                 pass
 
     def close(self, error: BaseException | None) -> None:
-        """Ends the session, with the exception of the caller's code if there is one. May be called again."""
+        """Ends the session, with the exception of the caller's code if there is one. May be called again.
+
+        A call from a device, in a control cycle, ends the run after this cycle. One in a forked process does nothing.
+        """
+        if os.getpid() != self._process:
+            return
         if not self._closing.is_set():
             self._end_error = error
             self._closing.set()
+        if self in _cycles.get():
+            return
         if self._thread is None:
             self._ended.set()
             self._requests.close()
@@ -195,11 +209,12 @@ class ControlLoop:
         if self._background:  # otherwise these resources are those of the run, too
             self._resources.close()
 
-    def _interrupt(self) -> None:
+    def _interrupt(self, again: bool) -> None:
         """Interrupts the program's own code at once, but a cycle in this thread, of any gripper, at its end."""
-        if (session := _cycles.get(threading.get_ident())) is None:
+        if cycles := _cycles.get():
+            cycles[-1].session.interrupt(again)
+        elif again or not self._closing.is_set():
             raise KeyboardInterrupt
-        session.interrupt()
 
     def _own_cycle(self) -> contextlib.ExitStack:
         """Lets only this thread run the control cycle: a second one would use the servo's port at the same time."""
@@ -217,6 +232,10 @@ class ControlLoop:
         self.close(None if hasattr(sys, "ps1") else getattr(sys, "last_value", None))
 
     def _raise_error(self) -> None:
+        if os.getpid() != self._process:
+            raise RequestError(
+                "the gripper belongs to the process that opened it; use it there, not in a fork"
+            )
         if self._error is not None:
             if self._error_was_raised and not isinstance(self._error, Exception):
                 raise RequestError("an interrupt has ended the run; close the gripper, and open it again")
@@ -241,6 +260,7 @@ class ControlLoop:
                 resolved, self._log, raise_if_cancelled=self._raise_if_closing, port=self._port
             ) as session:
                 try:
+                    _cycles.set((self,))
                     self._start(session)
                     while not self._closing.is_set() and self.owner() is not None:
                         self._cycle(session)

@@ -10,6 +10,7 @@ import struct
 import sys
 import termios
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,10 @@ SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 SWITCH_INTERVAL_S: Final = 2e-4
 """Python's default lets a computing thread delay the control thread by 5 ms."""
+
+_TOGETHER_S: Final = 1.0
+"""Signals that follow each other so soon have one cause. A lost connection sends SIGHUP twice: once from the kernel,
+once from the shell."""
 
 _SLICE_NS: Final = 100_000
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
@@ -42,11 +47,12 @@ class ProcessOptions:
 
 
 _allowed = ProcessOptions()
-_interrupts: list[Callable[[], None]] = []  # of the open grippers, the newest last
+_interrupts: list[Callable[[bool], None]] = []  # of the open grippers, the newest last
 _earlier_handlers: dict[int, signal._HANDLER] = {}
 _switch_intervals: list[float] = []  # before each open gripper, the program's own first
 _priorities = threading.local()  # the same for the priority of each thread
-_received: list[tuple[int, bool]] = []  # signals since the first gripper was opened; True: while one was open
+# Signals since the first gripper was opened: number, whether one was open, and the monotonic time.
+_received: list[tuple[int, bool, float]] = []
 
 
 def own_process(
@@ -150,11 +156,11 @@ def _set_time_slice(slice_ns: int) -> None:
 
 
 @contextmanager
-def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
+def deferred_signals(interrupt: Callable[[bool], None]) -> Iterator[None]:
     """Calls ``interrupt`` on a signal of `SIGNALS` instead of raising at once, if the program allows it.
 
     An exception in the middle of a bus transaction would leave the transaction incomplete. Of several open
-    grippers, the newest is interrupted.
+    grippers, the newest is interrupted. Its argument is True for Ctrl-C, which interrupts also what ends already.
     """
     if not _allowed.signals or threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
@@ -171,6 +177,12 @@ def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
         _interrupts.remove(interrupt)
         if not _interrupts and threading.current_thread() is threading.main_thread():
             _restore_handlers()
+
+
+def keep_in_forks(stack: ExitStack) -> None:
+    """Lets a stack do nothing at its end in a forked process: the devices and files are those of its parent."""
+    process = os.getpid()
+    stack.callback(lambda: os.getpid() == process or stack.pop_all())
 
 
 def raise_interrupt(number: int, _frame: FrameType | None) -> NoReturn:
@@ -195,17 +207,16 @@ def is_interrupted() -> bool:
 
 def has_stopped_run() -> bool:
     """Returns True if a signal of `SIGNALS` has come while a gripper was open."""
-    return any(in_run for _, in_run in _received)
+    return any(in_run for _, in_run, _ in _received)
 
 
 def _handle_signal(number: int, frame: FrameType | None) -> None:
     newest = _interrupts[-1:]  # a copy, because another thread may close the gripper now
     if newest:
-        is_first = not _received
+        is_alone = not _received or time.monotonic() - _received[-1][2] > _TOGETHER_S
         _receive(number)
-        # A lost connection sends SIGHUP twice: once from the kernel, once from the shell.
-        if is_first or number == signal.SIGINT:
-            newest[0]()
+        if is_alone or number == signal.SIGINT:
+            newest[0](number == signal.SIGINT)
         return
     # The last gripper was closed in another thread, which could not restore the handlers.
     _restore_handlers()
@@ -224,7 +235,7 @@ def _restore_handlers() -> None:
 
 
 def _receive(number: int) -> None:
-    _received.append((number, bool(_interrupts)))
+    _received.append((number, bool(_interrupts), time.monotonic()))
     if number == signal.SIGHUP:
         _discard_output_to_lost_terminal()
 

@@ -26,7 +26,7 @@ from gripper_force.runtime.log_queue import LogQueue
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.monitors import CounterMonitor, LoadCellMonitor
 from gripper_force.runtime.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
-from gripper_force.runtime.process import deferred_signals, real_time_settings
+from gripper_force.runtime.process import deferred_signals, keep_in_forks, real_time_settings
 from gripper_force.runtime.reading import read_patiently
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import (
@@ -171,15 +171,18 @@ class Session:
         """Makes the next cycle a stop, before any other request. Any thread or signal handler may call it."""
         self._stop_requested = True
 
-    def interrupt(self) -> None:
+    def interrupt(self, again: bool = True) -> None:
         """Makes the next cycle raise `KeyboardInterrupt` before it accesses the servo.
+
+        Args:
+            again: False: has no effect once the run is ending.
 
         Raises:
             KeyboardInterrupt: An earlier interrupt is still pending.
         """
-        if self._interrupted:
+        if self._interrupted and again:
             raise KeyboardInterrupt
-        self._interrupted = True
+        self._interrupted |= again or self._error is None
 
     def raise_if_interrupted(self) -> None:
         """Raises the pending `KeyboardInterrupt`, if there is one."""
@@ -428,12 +431,10 @@ def open_session(
         stack.enter_context(_interruptible(session))
         stack.callback(session.close)
         stack.callback(session.open_at_fault)
-        try:
-            session.start()
-            yield session
-        except BaseException as error:
-            session.fail(error)
-            raise
+        stack.push(lambda _kind, error, _trace: None if error is None else session.fail(error))
+        keep_in_forks(stack)
+        session.start()
+        yield session
     if log_queue is not None:
         log_queue.raise_losses()
 

@@ -947,7 +947,7 @@ def test_only_a_command_with_a_run_says_that_it_was_stopped(
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(60)
 
-    def end() -> None:
+    def end(_: bool) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gripper_force.config.load_with_options", interrupted)

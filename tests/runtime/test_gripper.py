@@ -1334,3 +1334,133 @@ def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(
     )
     assert done.returncode == -number, done.stderr
     assert done.stdout == ("True\n" if number == signal.SIGINT else "")
+
+
+@pytest.mark.usefixtures("own_process")
+def test_sigterm_after_a_handled_ctrl_c_ends_a_program(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "_TOGETHER_S", -1.0)
+    simulated()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGTERM):
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+
+
+@pytest.mark.usefixtures("own_process")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_only_ctrl_c_interrupts_the_end_of_a_run(
+    quick: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, number: signal.Signals
+) -> None:
+    monkeypatch.setattr(process, "_TOGETHER_S", -1.0)
+    opening = Session.wait_until_open
+
+    def with_signal(session: Session, status: gf.GraspStatus) -> gf.GraspStatus:
+        signal.raise_signal(number)
+        return opening(session, status)
+
+    path = tmp_path / "run.mcap"
+    with (
+        pytest.raises(KeyboardInterrupt if number == signal.SIGINT else ZeroDivisionError),
+        gf.open_gripper(overrides=[*quick, "control.on_fault=open"], log=path) as gripper,
+    ):
+        gripper.grasp(2.0)
+        monkeypatch.setattr(Session, "wait_until_open", with_signal)
+        raise ZeroDivisionError
+    is_opened = list(LogReader(path).records(gf.GraspStatus))[-1].width_m > 0.08
+    assert is_opened == (number == signal.SIGTERM)
+
+
+FORKED = """
+import os, sys
+import gripper_force as gf
+
+gripper = gf.open_gripper(overrides=sys.argv[3:], background=sys.argv[1] == "True", log=sys.argv[2])
+if os.fork() == 0:
+    try:
+        gripper.release()
+    except gf.RequestError as error:
+        print(error)
+    with gripper:
+        sys.exit(0)
+print(os.wait()[1], flush=True)
+input()
+gripper.stop()
+gripper.close()
+"""
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_forked_process_leaves_servo_and_log_alone(
+    quick: list[str], server: PtyServer, background: bool, tmp_path: Path
+) -> None:
+    sets = [*quick, *served_by(server), "control.on_fault=limp"]
+    command = [sys.executable, "-c", FORKED, str(background), str(tmp_path / "run.mcap"), *sets]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdin is not None
+        assert program.stdout is not None
+        assert program.stdout.readline().startswith(
+            "the gripper belongs to the process that opened it; use it"
+        )
+        assert program.stdout.readline() == "0\n"
+        assert torque(server) == 1
+        program.communicate("\n")
+    assert (program.returncode, torque(server)) == (0, 0)
+    assert LogReader(tmp_path / "run.mcap").complete
+
+
+def test_a_device_may_step_and_close_another_gripper(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gripper, other = simulated(), simulated("servo.port=virtual:second")
+    calls: list[Callable[[], object]] = [other.close, other.step]
+    cycle = Session.cycle
+
+    def with_call(session: Session, *request: Any, **named: Any) -> Any:
+        if session is gripper._loop.session:
+            calls.pop()()
+        return cycle(session, *request, **named)
+
+    monkeypatch.setattr(Session, "cycle", with_call)
+    for _ in range(2):
+        assert gripper.step().phase == gf.Phase.OPEN
+    with pytest.raises(gf.RequestError, match="the gripper is closed"):
+        other.step()
+
+
+@pytest.mark.parametrize("error", [None, ZeroDivisionError])
+def test_a_device_that_closes_its_own_gripper_ends_the_run_after_the_cycle(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch, error: type[Exception] | None
+) -> None:
+    gripper, other = simulated(), simulated("servo.port=virtual:second")
+    cycle, ended = Session.cycle, list[bool]()
+
+    def with_close(session: Session, *request: Any, **named: Any) -> Any:
+        (gripper.close if session is other._loop.session else other.step)()
+        decision = cycle(session, *request, **named)
+        ended.append(bool(torque()))
+        if error is not None and session is gripper._loop.session:
+            raise error
+        return decision
+
+    monkeypatch.setattr(Session, "cycle", with_close)
+    with pytest.raises(gf.RequestError if error is None else error):
+        gripper.grasp(2.0)
+    assert ended == [True, True]
+    assert find_bus("rig") is None
+
+
+def test_the_control_thread_may_close_its_gripper(
+    real_time: Open, server: PtyServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gripper, cycle, ended = real_time(), Session.cycle, list[bool]()
+
+    def with_close(session: Session, *request: Any, **named: Any) -> Any:
+        gripper.close()
+        ended.append(True)
+        return cycle(session, *request, **named)
+
+    monkeypatch.setattr(Session, "cycle", with_close)
+    with pytest.raises(gf.RequestError, match="closed"):
+        gripper.sleep(20.0)
+    assert (ended, torque(server)) == ([True], 0)

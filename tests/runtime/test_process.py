@@ -7,6 +7,7 @@ from types import FrameType
 
 import pytest
 
+from gripper_force.runtime import process
 from gripper_force.runtime.process import PRIORITY, deferred_signals, interrupt_exit_code, real_time_priority
 
 
@@ -118,7 +119,7 @@ def in_another_thread(stack: ExitStack) -> None:
 def test_a_signal_after_an_end_in_another_thread_is_handled_as_before() -> None:
     before, calls = signal.getsignal(signal.SIGINT), list[str]()
     stack = ExitStack()
-    stack.enter_context(deferred_signals(lambda: calls.append("ended")))
+    stack.enter_context(deferred_signals(lambda _: calls.append("ended")))
     in_another_thread(stack)
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
@@ -130,10 +131,10 @@ def test_a_signal_after_an_end_in_another_thread_is_handled_as_before() -> None:
 def test_the_handlers_return_when_the_next_gripper_is_closed() -> None:
     before = signal.getsignal(signal.SIGTERM)
     stack = ExitStack()
-    stack.enter_context(deferred_signals(lambda: None))
+    stack.enter_context(deferred_signals(lambda _: None))
     in_another_thread(stack)
     calls: list[str] = []
-    with deferred_signals(lambda: calls.append("next")):
+    with deferred_signals(lambda _: calls.append("next")):
         signal.raise_signal(signal.SIGTERM)
     assert calls == ["next"]
     assert signal.getsignal(signal.SIGTERM) == before
@@ -143,8 +144,8 @@ def test_the_handlers_return_when_the_next_gripper_is_closed() -> None:
 def test_grippers_may_close_in_any_order() -> None:
     before, calls = signal.getsignal(signal.SIGINT), list[str]()
     first, second = ExitStack(), ExitStack()
-    first.enter_context(deferred_signals(lambda: calls.append("first")))
-    second.enter_context(deferred_signals(lambda: calls.append("second")))
+    first.enter_context(deferred_signals(lambda _: calls.append("first")))
+    second.enter_context(deferred_signals(lambda _: calls.append("second")))
     first.close()
     signal.raise_signal(signal.SIGINT)
     second.close()
@@ -156,7 +157,7 @@ def test_grippers_may_close_in_any_order() -> None:
 def test_a_handler_that_the_program_sets_meanwhile_stays() -> None:
     before, calls = signal.getsignal(signal.SIGINT), list[int]()
     stack = ExitStack()
-    stack.enter_context(deferred_signals(lambda: None))
+    stack.enter_context(deferred_signals(lambda _: None))
     ours = signal.getsignal(signal.SIGINT)
     assert callable(ours)
 
@@ -178,7 +179,7 @@ def test_a_handler_that_the_program_sets_meanwhile_stays() -> None:
 @pytest.mark.usefixtures("own_process")
 def test_only_a_second_ctrl_c_interrupts_again() -> None:
     calls: list[str] = []
-    with deferred_signals(lambda: calls.append("interrupt")):
+    with deferred_signals(lambda _: calls.append("interrupt")):
         for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGTERM, signal.SIGQUIT):
             signal.raise_signal(number)
         assert len(calls) == 1
@@ -188,10 +189,21 @@ def test_only_a_second_ctrl_c_interrupts_again() -> None:
 
 
 @pytest.mark.usefixtures("own_process")
+def test_a_signal_some_time_after_another_interrupts_what_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program may have handled the first one."""
+    monkeypatch.setattr(process, "_TOGETHER_S", -1.0)
+    calls: list[bool] = []
+    with deferred_signals(calls.append):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGTERM):
+            signal.raise_signal(number)
+    assert calls == [True, False, False]
+
+
+@pytest.mark.usefixtures("own_process")
 def test_an_ignored_signal_stays_ignored() -> None:
     before, calls = signal.signal(signal.SIGHUP, signal.SIG_IGN), list[str]()
     try:
-        with deferred_signals(lambda: calls.append("interrupt")):
+        with deferred_signals(lambda _: calls.append("interrupt")):
             signal.raise_signal(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ class Device:
         self.at("__init__")
 
     def at(self, method):
-        if self.fails == method and (method in ("__init__", "start", "settings") or self.calls > 9):
+        if self.fails == method and (method in ("__init__", "start", "settings", "close") or self.calls > 9):
             raise ValueError(f"no {method}\\nhere")
 
     def result(self, method, right):
@@ -48,7 +49,8 @@ class Device:
         self.at("counts")
         return self.result("counts", {})
 
-    def close(self): ...
+    def close(self):
+        self.at("close")
 
 class Cell(Device):
     def drain(self):
@@ -119,6 +121,33 @@ def test_a_device_that_can_not_be_opened_is_named(
     assert not (tmp_path / "run.mcap").exists()
     *_, last = doctor.check_unit(with_own(config, unit, method), unit.replace("_", " "))
     assert (last.ok, "raised ValueError" in last.found) == (False, True)
+
+
+@pytest.mark.parametrize("unit", ["camera", "load_cell", "servo"])
+@pytest.mark.parametrize("error", [None, ZeroDivisionError()])
+def test_a_device_that_can_not_be_closed_hides_neither_result_nor_error(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unit: str, error: Exception | None
+) -> None:
+    realtime: dict[str, Any] = {"clock": "realtime", "camera": {"backend": "none"}}
+    keys = realtime | {"load_cell": {"backend": "none"}} if unit == "servo" else {}
+    monkeypatch.setattr(import_module("own_devices").Servo, "stopped", stopped := list[bool]())
+    named = rf"{unit}\.backend={UNITS[unit]}: {UNITS[unit].partition(':')[2]}\.close\(\) raised ValueError: no close here"
+
+    def run() -> None:
+        own = with_own(config, unit, "close", **keys)
+        with open_run(own, tmp_path / "run.mcap") as session:
+            session.wait_for_reference()
+            if error is not None:
+                raise error
+
+    with (
+        pytest.warns(RuntimeWarning, match=f"^a device was not closed: {named}{REMEDY}"),
+        nullcontext() if error is None else pytest.raises(ZeroDivisionError),
+    ):
+        run()
+    assert virtual.find_bus("rig") is None  # closed after the device
+    assert stopped == ([False] if unit == "servo" else [])
+    assert LogReader(tmp_path / "run.mcap").complete
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def torque_on(servo: Servo) -> Iterator[tuple[ServoState, Callable[[], None]]]:
         if signals:
             raise KeyboardInterrupt("the calibration was interrupted")
 
-    with deferred_signals(lambda: signals.append(True)):
+    with deferred_signals(signals.append):
         state = servo.start()  # if this raises, it has turned torque off itself
         try:
             yield state, raise_if_interrupted
