@@ -98,7 +98,6 @@ class Fusion:
         self._source = EstimateSource.CURRENT
         self._rejection = ""
         self._nothing_reported = True
-        self._gain_event = ""
         self.restart()
 
     def restart(self, *, was_held: bool = False, new_object: bool = False) -> None:
@@ -234,7 +233,6 @@ class Fusion:
             play_n = _PLAY_SHARE * self.current.friction_n * self.current.reversal
             unknown_n2 = self.current.friction_variance_n2 + FREE_FLOOR_N**2 + play_n**2
             self._object_gain.observe(current_n, visual.force_n, unknown_n2 + seen_n2)
-        self._shared_n2 = 0.0
         if (object_gain := self._applied_gain) is not None:
             force_n, std_n = object_gain.corrected(visual.force_n, visual.std_n)
             visual = replace(visual, force_n=force_n, std_n=std_n)

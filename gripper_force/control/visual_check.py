@@ -37,15 +37,13 @@ class VisualCheck:
     def __init__(self, config: ControlConfig) -> None:
         self._config = config
         self._force_n: float | None = None
-        self._std_n = 0.0
-        self._t_ns, self._before_n = 0, 0.0
-        self._covered_ns: int | None = None
-        self._has_seen = self._has_unsure = False
+        self._std_n, self._t_ns = 0.0, 0
+        self.start()
 
     def start(self) -> None:
         """Starts at the beginning of a grip."""
         self._has_seen = self._has_unsure = False
-        self._covered_ns = None
+        self._covered_ns: int | None = None
         self._before_n = max(self._force_n or 0.0, 0.0)
 
     def settle(self, friction_n: float) -> None:
