@@ -17,7 +17,7 @@ def test_simc_of_first_order_plus_delay():
 
 
 def test_simc_of_a_slow_plant_has_the_integral_time_of_the_rule():
-    gains = simc(Plant(gain=1.0, lag_s=10.0, delay_s=0.1))
+    gains = simc(Plant(gain=1.0, lag_s=1.0, delay_s=0.1))
     assert gains.proportional / gains.integral_s == pytest.approx(0.8)
 
 

@@ -63,6 +63,12 @@ def test_far_more_than_the_target_is_an_objection_unless_the_motor_current_prove
     assert not check.objection(4.0, 2.0)
 
 
+@pytest.mark.parametrize(("force_n", "objects"), [(2.0, False), (2.8, True)])
+def test_for_a_small_target_it_takes_more_than_the_target_to_be_far_more(force_n, objects):
+    check, _ = seen(force_n)
+    assert bool(check.objection(0.8, 0.0)) == objects
+
+
 def test_uncertain_estimates_alone_are_an_objection():
     check, _ = seen(4.0, std_n=2 * CONFIG.vision_std_n)
     assert check.objection(4.0, 4.0) == "the camera is uncertain"
@@ -72,12 +78,13 @@ def test_uncertain_estimates_alone_are_an_objection():
 def test_estimates_that_are_not_finite_do_not_count(strange):
     check, t_ns = seen(4.0)
     check.add(t_ns + 1, visual(t_ns + 1, **strange), gripping=True)
-    assert not check.objection(4.0, 4.0)
+    assert not check.objection(4.0, 1.9)
 
 
 def test_a_frame_from_the_future_does_not_count():
     check, t_ns = seen(0.0)
     check.add(t_ns + 1, visual(t_ns + 3600 * 1000 * NS_PER_MS, 9.0), gripping=True)
+    assert check.objection(4.0, 4.0)
     for cycle in range(1, 31):
         check.add(t_ns + cycle * FRAME_NS, visual(t_ns + cycle * FRAME_NS, 4.0), gripping=True)
     assert not check.objection(4.0, 0.0)
@@ -86,6 +93,7 @@ def test_a_frame_from_the_future_does_not_count():
 def test_a_camera_that_has_stopped_objects_to_nothing():
     check, t_ns = seen(0.0)
     assert check.objection(4.0, 4.0)
+    check.add(t_ns + 1, visual(t_ns + 1, std_n=2 * CONFIG.vision_std_n), gripping=True)
     check.add(t_ns + 1000 * NS_PER_MS, None, gripping=True)
     assert not check.objection(4.0, 4.0)
 
@@ -101,6 +109,7 @@ def covered(check, t_ns, cycles=3):
 def test_once_the_view_is_covered_the_motor_current_has_to_prove_the_grip():
     check, t_ns = seen(4.0)
     t_ns = covered(check, t_ns, 1)
+    check.add(t_ns + 5 * NS_PER_MS, None, gripping=True)  # a cycle without a new frame
     assert check.objection(4.0, 1.9) == "the object is gone, or the view is covered or blurred"
     assert not check.objection(4.0, 2.0)
     covered(check, t_ns, 100)  # longer than an estimate is valid
@@ -138,6 +147,7 @@ def test_a_view_that_was_covered_before_the_grip_objects_to_nothing(before):
         check, t_ns = seen(4.0)
     t_ns = covered(check, t_ns)
     check.start()
+    assert "covered" not in check.objection(4.0, 1.9)
     covered(check, t_ns, 100)
     assert not check.objection(4.0, 1.9)
 
@@ -164,3 +174,12 @@ def test_a_rise_before_the_ramp_counts_only_as_far_as_friction_may_hold_it(frict
             check.settle(friction_n)
         check.add(cycle * FRAME_NS, visual(cycle * FRAME_NS, 7.7), gripping=True)
     assert bool(check.objection(4.5, 4.5)) == objects
+
+
+def test_a_camera_that_starts_after_the_contact_confirms_a_grip():
+    check = VisualCheck(CONFIG)
+    check.start()
+    check.settle(0.2)
+    for cycle in range(1, 31):
+        check.add(cycle * FRAME_NS, visual(cycle * FRAME_NS, 0.8), gripping=True)
+    assert not check.objection(4.0, 4.0)
