@@ -8,35 +8,43 @@ Ctrl-C.
 A command imports what it needs when it runs, so that ``gripper-force --help`` answers at once.
 """
 
-import errno
-import gc
-import json
-import os
-import signal
 import sys
-from io import TextIOWrapper
-from pathlib import Path
-from typing import Annotated, NoReturn
 
-import typer
-from rich.markup import escape
+_INTERRUPTED = 130
 
-from gripper_force import __version__
-from gripper_force.cli import (
-    bench,
-    calibrate,
-    configuration,
-    console,
-    data,
-    exports,
-    learning,
-    runs,
-    setup,
-    stability,
-    viewing,
-)
-from gripper_force.errors import GripperError
-from gripper_force.plugins import importing
+try:
+    import errno
+    import gc
+    import json
+    import os
+    import signal
+    import warnings
+    from io import TextIOWrapper
+    from pathlib import Path
+    from typing import Annotated, NoReturn
+
+    import typer
+    from rich.markup import escape
+
+    from gripper_force import __version__
+    from gripper_force.cli import (
+        bench,
+        calibrate,
+        configuration,
+        console,
+        data,
+        exports,
+        learning,
+        runs,
+        setup,
+        stability,
+        viewing,
+    )
+    from gripper_force.errors import GripperError
+    from gripper_force.plugins import importing
+    from gripper_force.runtime import process
+except KeyboardInterrupt:  # nothing has begun, so there is nothing to say
+    sys.exit(_INTERRUPTED)
 
 app = typer.Typer(
     help="Gripper force control from camera images: run, calibrate, replay.",
@@ -66,20 +74,17 @@ app.add_typer(configuration.app, name="config")
 app.add_typer(bench.app, name="bench")
 app.add_typer(stability.app, name="stability")
 
-_INTERRUPTED = 130
-
 
 def main() -> NoReturn:
     """Runs a command, and turns every foreseen failure into a one-line message and an exit code."""
-    from gripper_force.runtime import process
-
-    process.own_process()
-    if isinstance(sys.stdout, TextIOWrapper):  # a file's name may be no text
-        sys.stdout.reconfigure(errors="backslashreplace")
-    for number in process.SIGNALS:
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
-            signal.signal(number, process.raise_interrupt)
     try:
+        process.own_process()
+        warnings.showwarning = _show_warning
+        if isinstance(sys.stdout, TextIOWrapper):  # a file's name may be no text
+            sys.stdout.reconfigure(errors="backslashreplace")
+        for number in process.SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
+                signal.signal(number, process.raise_interrupt)
         with importing("this command"):
             try:
                 app(prog_name="gripper-force")
@@ -125,8 +130,6 @@ def _fail_without_file(error: OSError) -> NoReturn:
 def _fail(message: str) -> NoReturn:
     console.err.print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
     _print_json_error(message)
-    from gripper_force.runtime import process
-
     # An interrupt can appear as an error of what it met, such as an import.
     sys.exit(process.interrupt_exit_code() if process.is_interrupted() else 2)
 
@@ -134,6 +137,10 @@ def _fail(message: str) -> NoReturn:
 def _print_json_error(message: str) -> None:
     if "--json" in sys.argv:
         sys.stdout.write(json.dumps({"error": message}) + "\n")
+
+
+def _show_warning(message: Warning | str, *_place: object, **_named: object) -> None:
+    console.warn(str(message))
 
 
 def _print_version(value: bool) -> None:

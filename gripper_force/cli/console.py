@@ -4,7 +4,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -45,9 +45,11 @@ class Bar:
     def __init__(self, shown: ProgressBar, task: TaskID) -> None:
         self._shown, self._task = shown, task
         self.stop, self.start = shown.stop, shown.start
+        self.has_done = False
 
     def __call__(self, text: str, steps: int = 1) -> None:
         """Reports progress, see `Progress`."""
+        self.has_done |= not text.startswith("failed: ")
         self._shown.update(self._task, advance=steps, note=text)
 
 
@@ -57,8 +59,16 @@ def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Bar]":
     left = TimeRemainingColumn(elapsed_when_finished=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), left)
     note = TextColumn("{task.fields[note]}", markup=False)
-    with ProgressBar(*columns, note, console=err, disable=hidden, speed_estimate_period=_SPEED_S) as shown:
-        yield Bar(shown, shown.add_task(label, total=total, note=""))
+    shown = ProgressBar(*columns, note, console=err, disable=hidden, speed_estimate_period=_SPEED_S)
+    running = Bar(shown, shown.add_task(label, total=total, note=""))
+    shown.start()
+    try:
+        yield running
+    except Exception:
+        shown.live.transient = not running.has_done  # the input is wrong, and the error says all
+        raise
+    finally:
+        shown.live.stop() if shown.live.transient else shown.stop()
 
 
 def bar_or_lines(label: str, total: int) -> "AbstractContextManager[Progress]":
@@ -112,6 +122,12 @@ def answering(unanswered: str) -> Iterator[None]:
 def warn(text: str) -> None:
     """Prints a warning on stderr."""
     err.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
+
+
+def warn_of_other_rig(differences: Iterable[str]) -> None:
+    """Warns that logs differ from the one rig that the network learned from, if there are differences."""
+    if texts := sorted(set(differences)):
+        warn(f"the network learned from one rig only, and logs are of another: {'; '.join(texts)}")
 
 
 def command(*words: object) -> str:

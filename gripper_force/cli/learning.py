@@ -279,10 +279,7 @@ def evaluate(
             progress=progress,
         )
     _warn_left_out(result.left_out, len(logs))
-    if result.other_rig:
-        console.warn(
-            f"the network learned from one rig only, and logs are of another: {'; '.join(result.other_rig)}"
-        )
+    console.warn_of_other_rig(result.other_rig)
     console.show(result, as_json, errors_table)
     if plot is not None:
         console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)

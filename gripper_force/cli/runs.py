@@ -284,6 +284,7 @@ def replay(
         return
     with console.bar("replaying", len(paths), hidden=len(paths) == 1) as progress:
         replays = replay_all(checkpoint=checkpoint, overrides=set_, progress=progress)
+    console.warn_of_other_rig(text for result in replays.results for text in result.other_rig)
     pages: list[str] = []
     unreported: dict[str, GripperError] = {}
     if report:
@@ -382,6 +383,7 @@ def _compare(
             replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
             for other, changes in sides
         )
+    console.warn_of_other_rig(text for one in (*first.results, *second.results) for text in one.other_rig)
     failed = {**first.failed, **second.failed}
     kept, others = (
         [(r, one) for r, one in zip(side.results, side.columns, strict=True) if r.log not in failed]

@@ -24,6 +24,7 @@ from gripper_force.schema import Tree, as_path
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record, ServoState
 
 if TYPE_CHECKING:  # labels need no OpenCV
+    from gripper_force.vision.header import Header
     from gripper_force.vision.preprocess import Preprocess, Region
 
 CONTACT_N: Final = 0.25
@@ -90,6 +91,18 @@ class Clip:
     def nominal_n(self) -> npt.NDArray[np.float32]:
         """Forces with the nominal stiffness of the object's kind, (T,); as measured if stiffness is unknown."""
         return self.forces_n if math.isnan(self.stiffness) else self.forces_n / np.float32(self.stiffness)
+
+
+def other_rig(header: "Header", logged: Config, *, is_profiled: bool) -> list[str]:
+    """Returns the settings of camera and gripper in which a log differs from the one rig that a network learned from.
+
+    Args:
+        header: Header of the network.
+        logged: Configuration of the log, with the region that is used now.
+        is_profiled: True if an object profile is used, which is of a rig of its own.
+    """
+    is_known = logged.gripper.nm_per_a is not None  # that of an imported recording is not
+    return header.mismatches(logged.rig_settings()) if is_known and not is_profiled else []
 
 
 def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:

@@ -19,6 +19,7 @@ from gripper_force.jobs.dataset import (
     StreamedClip,
     find_logs,
     label_mask,
+    other_rig,
     starts_in_contact,
     stiffness_floor_n,
     without_contact_starts,
@@ -258,10 +259,8 @@ def _evaluate_log(
     if starts_in_contact(clip.forces_n, preprocess) and not include_contact_starts:
         return _Evaluated(clip, None)
     region = settings.vision.region or logged.vision.region
-    rig = logged.with_values(vision={"region": region}).rig_settings()
-    # A profile is of its own rig, and the rig of an imported recording is not known.
-    known = correction is None and logged.gripper.nm_per_a is not None
-    differs = loaded.header.mismatches(rig) if known else ()
+    used = logged.with_values(vision={"region": region})
+    differs = other_rig(loaded.header, used, is_profiled=correction is not None)
     return _Evaluated(clip, (1.0 if gain is None else gain.gain) * forces_n, differs)
 
 

@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
+from gripper_force import cli
+
 COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
 IMPORT = "import database db --out logs"
 _AGAIN_S = 2.0
@@ -138,6 +140,31 @@ def test_an_output_that_nobody_reads_is_no_error(tmp_path: Path) -> None:
     )
     os.close(writer)
     assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_a_wrong_input_leaves_no_bar_beside_its_sentence(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).write_text("no log")
+    command = [*COMMAND, "replay", "a.mcap", "b.mcap", "--jobs", "1"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stderr == "error: a.mcap is not an MCAP file; pass a log that gripper-force wrote\n"
+    shown = on_terminal(command, tmp_path, TERM="xterm-256color")[1]
+    line_up_and_erased = r"\x1b\[1A\x1b\[2K"
+    assert re.search(rf"b\.mcap\s+(\x1b\[\?25h)?\r?{line_up_and_erased}\x1b\[1;31merror:", shown), shown
+
+
+def test_ctrl_c_while_the_command_line_is_imported_ends_without_a_word(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("import signal; signal.raise_signal(signal.SIGINT)")
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    command = [*COMMAND, "config", "show"]
+    env = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_a_warning_of_the_library_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    cli._show_warning(RuntimeWarning("a device was not closed: it is [gone]"), RuntimeWarning, "file", 1)
+    assert capsys.readouterr().err == "warning: a device was not closed: it is [gone]\n"
 
 
 def test_without_a_terminal_a_bar_is_printed_once(folder: Path) -> None:

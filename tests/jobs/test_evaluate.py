@@ -13,6 +13,7 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, load_clips
 from gripper_force.jobs.estimates import estimate_clips
 from gripper_force.jobs.evaluate import Evaluation, errors_on, evaluate
+from gripper_force.jobs.replay import replay
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import LoadCellSample
@@ -171,6 +172,13 @@ def test_logs_of_another_rig_than_that_of_the_network_are_told(
     done = CliRunner().invoke(cli.app, call)
     assert json.loads(done.stdout)["other_rig"] == ["vision.region [0, 0, 10, 10], not None"]
     assert "learned from one rig only, and logs are of another: vision.region" in done.stderr
+    for more in ([], ["--compare", "log", "control.ramp_n_s=4"]):
+        again = CliRunner().invoke(
+            cli.app, ["replay", str(few_logs), "--set", f"vision.checkpoint={network}", "--jobs", "1", *more]
+        )
+        assert again.stderr.count("learned from one rig only, and logs are of another: vision.region") == 1
+    assert replay(few_logs / "run.mcap", network).other_rig == ["vision.region [0, 0, 10, 10], not None"]
+    assert replay(reader.path, network).other_rig == []
     same = Config().with_values(vision={"region": (0, 0, 10, 10)})
     assert evaluate(few_logs, network, config=same).other_rig == []
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from gripper_force import __version__
 from gripper_force.config import Overrides, config_from_text
 from gripper_force.errors import DataError, GripperError
+from gripper_force.jobs.dataset import other_rig
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.replay.comparison import (
     Columns,
@@ -79,6 +80,11 @@ def replay_frames(
     overall = (
         {} if best is None else {key: getattr(best, key) for key in ("mae_n", "rmse_n", "bias_n", "frames")}
     )
+    differs = (
+        []
+        if resolved.model is None
+        else other_rig(resolved.model.header, resolved.config, is_profiled=resolved.correction is not None)
+    )
     result = ReplayResult(
         mae_n=None if best is None else best.mae_n,
         rmse_n=None if best is None else best.rmse_n,
@@ -93,6 +99,7 @@ def replay_frames(
         changed=agreement.changed,
         sources=sources,
         log=str(path),
+        other_rig=differs,
     )
     return result, columns_of(result.log, resolved.config.object, series, cells)
 

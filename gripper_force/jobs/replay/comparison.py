@@ -3,7 +3,7 @@
 import math
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,8 @@ class ReplayResult:
         changed: Largest differences from the log: ``goal_current_a``, ``fused_n``; empty without any.
         sources: `Comparison` by source: ``visual``, ``current``, ``fused``.
         log: Path of the log.
+        other_rig: Settings of camera and gripper in which the log differs from the one rig that the network learned
+            from.
     """
 
     mae_n: float | None
@@ -79,6 +81,7 @@ class ReplayResult:
     changed: dict[str, float]
     sources: dict[str, Comparison]
     log: str
+    other_rig: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
