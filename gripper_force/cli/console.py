@@ -49,7 +49,7 @@ class Bar:
 
     def __call__(self, text: str, steps: int = 1) -> None:
         """Reports progress, see `Progress`."""
-        self.has_done |= not text.startswith("failed: ")
+        self.has_done |= not text.startswith("failed: ") and steps > 0
         self._shown.update(self._task, advance=steps, note=text)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from gripper_force import cli
+from gripper_force.cli import console
 
 COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
 IMPORT = "import database db --out logs"
@@ -151,6 +152,13 @@ def test_a_wrong_input_leaves_no_bar_beside_its_sentence(tmp_path: Path) -> None
     shown = on_terminal(command, tmp_path, TERM="xterm-256color")[1]
     line_up_and_erased = r"\x1b\[1A\x1b\[2K"
     assert re.search(rf"b\.mcap\s+(\x1b\[\?25h)?\r?{line_up_and_erased}\x1b\[1;31merror:", shown), shown
+
+
+def test_a_bar_without_a_step_is_not_beside_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ZeroDivisionError), console.bar("simulating", 3) as progress:
+        progress("", 0)
+        raise ZeroDivisionError
+    assert capsys.readouterr().err == ""
 
 
 def test_ctrl_c_while_the_command_line_is_imported_ends_without_a_word(tmp_path: Path) -> None:
