@@ -122,6 +122,7 @@ def update_cache(measured: dict[str, EngineCandidate]) -> None:
         _cache_file().parent.mkdir(parents=True, exist_ok=True)
         with _cache_file().open("a", encoding="utf-8") as file:
             file.write("".join(lines))
+        _cache_file().with_suffix(".json").unlink(missing_ok=True)  # of earlier versions
 
 
 def _cache_file() -> Path:

@@ -59,6 +59,7 @@ def test_cache_keeps_earlier_measurements(cache: Path) -> None:
     fast = EngineCandidate("default", "openvino", "bfloat16", 2, 1.0, 1.5, 0.19)
     assert read_cache() == {}
     update_cache({"a": slow})
+    (cache.parent / "engines.json").write_text("{}")  # of an earlier version
     update_cache({"b": fast})
     assert read_cache() == {"a": slow, "b": fast}
     assert [path.name for path in cache.parent.iterdir()] == ["engines.jsonl"]
