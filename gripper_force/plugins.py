@@ -1,19 +1,23 @@
 """Lookup of classes by name: built-in ones, registered entry points, and ``package.module:Class``."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from numbers import Integral, Real
 from operator import attrgetter
 from typing import Any, Final
 
 from gripper_force.errors import ConfigError, DeviceError, GripperError
 
 _METHODS: Final = {
-    "servos": dict.fromkeys(("spec", "start", "write", "stop", "close"), "object") | {"read": "ServoState"},
+    "servos": dict.fromkeys(("spec", "start", "write", "stop", "close"), "object")
+    | {"spec": "ServoSpec", "read": "ServoState"},
     "cameras": {"newest": "Frame NoneType", "start": "object", "counts": "dict", "close": "object"},
     "load_cells": {"drain": "list tuple", "start": "object", "counts": "dict", "close": "object"},
     "engines": {"step": "StepOutput", "warm_up": "object", "reset": "object"},
@@ -23,6 +27,9 @@ _METHODS: Final = {
 A class, or the object that a function returns, is checked for the methods before it is used. A wrong type is reported
 here, where the class is known. They are names, because importing the types takes time.
 """
+
+_ATTRIBUTES: Final = {"servos": {"stats": "BusStats"}, "engines": {"header": "Header"}}
+"""The same for attributes of the objects."""
 
 EXTRAS: Final = {
     **dict.fromkeys(("torch", "onnx", "onnxscript"), "train"),
@@ -105,7 +112,7 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
 
 
 def _check_methods(part: Any, group: str, name: str) -> None:
-    if missing := [method for method in _METHODS.get(group, ()) if not hasattr(part, method)]:
+    if missing := [method for method in _METHODS.get(group, ()) if not callable(getattr(part, method, None))]:
         raise ConfigError(
             f"{name} has no method {missing[0]!r}; name a class with the methods that {_interface(group)} describes"
         )
@@ -115,11 +122,53 @@ def _interface(group: str) -> str:
     return f"gripper_force.{'vision.engines.Engine' if group == 'engines' else 'interfaces'}"
 
 
+def wrong_result(result: Any, expected: str, now_ns: Callable[[], int] | None = None) -> str:
+    """Returns what is wrong with a result of third-party code, or an empty text.
+
+    Args:
+        result: The result. The fields of a record and the items of a list are checked, too.
+        expected: Names of the types that it may have.
+        now_ns: Returns the time on the run's clock; None: times are not compared with it. A time that is further from
+            it than 10 s is of another clock, or in another unit.
+    """
+    own = ("builtins", "gripper_force.")  # another class may have the same name
+    names = {base.__name__ for base in type(result).__mro__ if base.__module__.startswith(own)}
+    if names.isdisjoint(expected.split()):
+        return type(result).__name__
+    if expected == "dict":
+        wrong = [f"{{{k!r}: {n!r}}}" for k, n in result.items() if not (isinstance(k, str) and _is_count(n))]
+        return f"{wrong[0]}, which is no name with a whole number of 0 or more" if wrong else ""
+    if isinstance(result, list | tuple):
+        return next(filter(None, (wrong_result(item, "LoadCellSample", now_ns) for item in result)), "")
+    for field in fields(result) if is_dataclass(result) else ():
+        value, kind = getattr(result, field.name), getattr(field.type, "__name__", field.type)
+        problem, shown = "", ""
+        if kind == "float" and not isinstance(value, Real):
+            problem = "not a number"
+        elif kind == "int" and not _is_count(value):
+            problem = "not a whole number of 0 or more"
+        elif field.name == "gray":
+            shown = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}"
+            is_image = getattr(value, "dtype", "") == "uint8" and value.ndim == 2 and value.size
+            problem = "" if is_image else "not an image, (H, W) uint8"
+        elif now_ns and field.name in ("t_ns", "received_ns") and abs(s := (value - now_ns()) / 1e9) > 10:
+            problem = f"{s:+.3g} s from the present: use the clock that the class gets, in nanoseconds"
+        elif field.name == "valid" and value and not math.isfinite(result.force_n):
+            return f"a valid LoadCellSample whose force_n is {result.force_n}, which is not finite"
+        if problem:
+            return f"a {type(result).__name__} whose {field.name} is {shown.strip() or repr(value)[:60]}, {problem}"
+    return ""
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, Integral) and 0 <= int(value) < 2**63
+
+
 class _Plugin:
     """A third-party class, or an object that it made: an error of its code names it, its method and the error."""
 
-    def __init__(self, part: Any, group: str, name: str) -> None:
-        self._part, self._group, self._name = part, group, name
+    def __init__(self, part: Any, group: str, name: str, now_ns: Callable[[], int] | None = None) -> None:
+        self._part, self._group, self._name, self._now_ns = part, group, name, now_ns
         self._error_type: type[GripperError] = ConfigError if group == "engines" else DeviceError
 
     def __getattr__(self, name: str) -> Any:
@@ -130,7 +179,11 @@ class _Plugin:
     def __call__(self, *arguments: Any) -> Any:
         made = self._call(self._part, self._name, *arguments)
         _check_methods(made, self._group, f"{self._name}()")
-        return _Plugin(made, self._group, self._name)
+        for name in _ATTRIBUTES.get(self._group, ()):
+            self._call(getattr, f"{self._name}.{name}", made, name, None)  # checks it
+        # The second argument of a device is its clock, or the function. No result of an engine has a time.
+        clock = next(iter(arguments[1:]), None)
+        return _Plugin(made, self._group, self._name, getattr(clock, "now_ns", clock))
 
     def _call(self, function: Callable[..., Any], called: str, *arguments: Any, **named: Any) -> Any:
         try:
@@ -143,9 +196,9 @@ class _Plugin:
                 f"{called}() raised {type(error).__name__}: {' '.join(str(error).split())}; it is no part of "
                 "gripper-force: correct it, or tell its author"
             ) from error
-        expected = _METHODS.get(self._group, {}).get(called.rpartition(".")[2], "object").split()
-        if not any(base.__name__ in expected for base in type(result).__mro__):
-            found = f"{called}() returned {type(result).__name__}"
+        types = _METHODS.get(self._group, {}) | _ATTRIBUTES.get(self._group, {})
+        if problem := wrong_result(result, types.get(called.rpartition(".")[2], "object"), self._now_ns):
+            found = f"{called}() returned {problem}"
             raise self._error_type(f"{found}; return what {_interface(self._group)} says")
         return result
 

@@ -33,7 +33,11 @@ def read_patiently(
     """
     while True:
         try:
-            return servo.read()
+            state = servo.read()
+            # Without its time nothing would end: every deadline of the controller is on it.
+            if last and state.t_ns <= last.t_ns and clock.now_ns() - last.t_ns > patience_ns:
+                raise DeviceTimeoutError("the servo's t_ns stands still; it must be the time of the reading")  # noqa: TRY301
+            return state  # noqa: TRY300
         except DeviceTimeoutError:
             next_ns = clock.now_ns() + period_ns
             if last is None or next_ns - last.t_ns > patience_ns:

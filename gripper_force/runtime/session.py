@@ -20,6 +20,7 @@ from gripper_force.config import Config, dump_config
 from gripper_force.control.state_machine import Decision, GraspController, is_open
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
 from gripper_force.interfaces import Devices, SharedPort
+from gripper_force.plugins import wrong_result
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_codecs import UTC_NAME
 from gripper_force.runtime.log_queue import LogQueue
@@ -135,8 +136,10 @@ class Session:
         self._raise_if_ended()
         state = self._devices.servo.start()  # if it raises, it has turned torque off itself
         self._armed = True
-        if not isinstance(state, ServoState):  # of a user's class, whose torque is on now
-            raise DeviceError(f"servo.start() returned {type(state).__name__}; return a ServoState")
+        if problem := wrong_result(state, "ServoState", self._devices.clock.now_ns):
+            # Of a user's class, whose torque is on now. Only a session can turn it off as configured.
+            name = self.resolved.config.servo.backend
+            raise DeviceError(f"servo.backend={name}: start() returned {problem}; return a ServoState")
         if problem := self._controller.start_problem(state):
             raise DeviceError(problem)
         self._perception.start()

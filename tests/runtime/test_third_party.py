@@ -2,15 +2,17 @@
 
 import json
 import sys
+import time
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gripper_force.config import Config, load_config
-from gripper_force.errors import ConfigError, DeviceError
+from gripper_force.errors import ConfigError, DeviceError, DeviceTimeoutError
 from gripper_force.jobs import doctor
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.plugins import load_class
@@ -18,7 +20,7 @@ from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_run, open_session
-from gripper_force.types import Event, Frame, GraspStatus, Phase, RequestKind
+from gripper_force.types import Event, Frame, GraspStatus, LoadCellSample, Phase, RequestKind, ServoState
 from gripper_hw.dynamixel import virtual
 
 DEVICES = """
@@ -83,7 +85,7 @@ class Servo(Device):
 
     def read(self):
         self.at("read")
-        return self.result("read", ServoState(self.clock(), 0.0, 0.0, 0.0, 12.0, 30.0, 0))
+        return self.result("read", ServoState(self.clock(), 0.0, 0.0, 0.0, 30.0, 12.0, 0))
 
     def write(self, command):
         self.calls += 1
@@ -305,9 +307,142 @@ def test_a_servo_whose_start_returns_nothing_is_told_to_stop(
     servo = import_module("own_devices").Servo
     monkeypatch.setattr(servo, "stopped", [])
     monkeypatch.setattr(servo, "start", lambda self: None)
-    with pytest.raises(DeviceError, match=r"^servo\.start\(\) returned NoneType; return a ServoState"):
+    with pytest.raises(
+        DeviceError,
+        match=r"^servo\.backend=own_devices:Servo: start\(\) returned NoneType; return a ServoState",
+    ):
         run_grasp(own, tmp_path / "run.mcap")
     assert servo.stopped == [False]
+
+
+FRAME = "a Frame whose "
+SAMPLE = "a LoadCellSample whose "
+STATE = "a ServoState whose "
+IMAGE = "not an image, \\(H, W\\) uint8"
+OTHER_CLOCK = "s from the present: use the clock that the class gets, in nanoseconds"
+RECORDS: list[tuple[str, str, str, str]] = [
+    (
+        "camera",
+        "newest",
+        "Frame(now, now, 1, np.zeros((4, 5, 3), np.uint8))",
+        rf"{FRAME}gray is uint8 \(4, 5, 3\), {IMAGE}",
+    ),
+    (
+        "camera",
+        "newest",
+        "Frame(now, now, 1, np.zeros((4, 5)))",
+        rf"{FRAME}gray is float64 \(4, 5\), {IMAGE}",
+    ),
+    ("camera", "newest", "Frame(now, now, 1, None)", f"{FRAME}gray is NoneType, {IMAGE}"),
+    ("camera", "newest", "Frame(now, now, -1, gray)", f"{FRAME}seq is -1, not a whole number of 0 or more"),
+    ("camera", "newest", "Frame(-1, now, 1, gray)", f"{FRAME}t_ns is -1, not a whole number of 0 or more"),
+    ("camera", "newest", "Frame(now, now / 1e9, 1, gray)", f"{FRAME}received_ns is .*, not a whole number"),
+    (
+        "camera",
+        "newest",
+        "Frame(time.time_ns(), now, 1, gray)",
+        rf"{FRAME}t_ns is \d+, \+.* {OTHER_CLOCK}",
+    ),
+    ("camera", "newest", "(now, now, 1, gray)", "tuple"),
+    ("camera", "counts", "{'lost': '3'}", r"{'lost': '3'}, which is no name with a whole number"),
+    ("load_cell", "drain", "[None]", "NoneType"),
+    ("load_cell", "drain", "[LoadCellSample(now, '1', 1.0)]", f"{SAMPLE}force_n is '1', not a number"),
+    (
+        "load_cell",
+        "drain",
+        "[LoadCellSample(now, float('nan'), 1.0)]",
+        "a valid LoadCellSample whose force_n is nan, ",
+    ),
+    (
+        "load_cell",
+        "drain",
+        "[LoadCellSample(now + 10**11, 1.0, 1.0)]",
+        rf"{SAMPLE}t_ns is \d+, \+100 {OTHER_CLOCK}",
+    ),
+    ("servo", "read", "(now, 0.0)", "tuple"),
+    (
+        "servo",
+        "read",
+        "ServoState(now, None, 0.0, 0.0, 30.0, 12.0, 0)",
+        f"{STATE}position_rad is None, not a number",
+    ),
+    (
+        "servo",
+        "read",
+        "ServoState(now // 10**9, 0.0, 0.0, 0.0, 30.0, 12.0, 0)",
+        rf"{STATE}t_ns is \d+, -.* {OTHER_CLOCK}",
+    ),
+    ("servo", "read", "type('ServoState', (), {'__module__': 'own'})()", "ServoState"),
+]
+
+
+@pytest.mark.parametrize(("unit", "method", "result", "sentence"), RECORDS)
+def test_a_record_with_a_wrong_field_ends_the_run_at_once(
+    config: Config,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    unit: str,
+    method: str,
+    result: str,
+    sentence: str,
+) -> None:
+    path = tmp_path / "run.mcap"
+    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}} if unit == "servo" else {}
+    own = with_own(config, unit, "", clock="realtime" if unit == "servo" else "lockstep", **none)
+    module = import_module("own_devices")
+    right = getattr(getattr(module, UNITS[unit].partition(":")[2]), method)
+
+    def wrong(self: Any) -> object:
+        right_result = right(self)
+        if self.calls < 10:
+            return right_result
+        now = self.clock() if unit == "servo" else self.clock.now_ns()
+        names = {"now": now, "np": np, "time": time, "gray": np.zeros((4, 5), np.uint8)}
+        return eval(
+            result, {**names, "Frame": Frame, "LoadCellSample": LoadCellSample, "ServoState": ServoState}
+        )
+
+    monkeypatch.setattr(module.Servo, "stopped", [])
+    monkeypatch.setattr(getattr(module, UNITS[unit].partition(":")[2]), method, wrong)
+    name = UNITS[unit]
+    with pytest.raises(
+        DeviceError,
+        match=rf"^{unit}\.backend={name}: {name.partition(':')[2]}\.{method}\(\) returned {sentence}",
+    ):
+        run_grasp(own, path)
+    assert LogReader(path).complete
+    assert module.Servo.stopped == ([False] if unit == "servo" else [])
+
+
+def test_a_servo_whose_time_stands_still_ends_the_run(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
+    own = with_own(config, "servo", "", clock="realtime", **none)
+    servo = import_module("own_devices").Servo
+    state = ServoState(time.monotonic_ns(), 0.0, 0.0, 0.0, 30.0, 12.0, 0)
+    monkeypatch.setattr(servo, "stopped", [])
+    monkeypatch.setattr(servo, "read", lambda self: state)
+    with pytest.raises(DeviceTimeoutError, match=r"^the servo's t_ns stands still; "):
+        run_grasp(own, tmp_path / "run.mcap")
+    assert servo.stopped == [False]
+
+
+def test_a_servo_without_counters_is_named(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
+    own = resolve(with_own(config, "servo", "", clock="realtime", **none))
+    monkeypatch.setattr(import_module("own_devices").Servo, "stats", None)
+    with (
+        pytest.raises(
+            DeviceError,
+            match=r"Servo\.stats\(\) returned NoneType; return what gripper_force\.interfaces says$",
+        ),
+        open_devices(own.config),
+    ):
+        pass
+    monkeypatch.delattr(import_module("own_devices").Servo, "stats")
+    with pytest.raises(DeviceError, match=r"Servo\.stats\(\) returned NoneType"), open_devices(own.config):
+        pass
 
 
 def test_an_engine_and_a_module_that_fail_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,7 +475,7 @@ class Eyes(Engine):
         features = np.zeros(sum(member.head for member in members), np.float32)
         return {result}
 """
-NO_ARRAYS = rf"^vision\.engine=own_eyes:Eyes: Eyes\.warm_up\(\) raised TypeError: forces_n and features must be NumPy arrays of 1 dimension, .*{REMEDY}"
+NO_ARRAYS = rf"^vision\.engine=own_eyes:Eyes: Eyes\.warm_up\(\) raised TypeError: forces_n and features must be NumPy arrays of floats of 1 dimension, .*{REMEDY}"
 
 
 @pytest.mark.parametrize(

@@ -42,9 +42,10 @@ class StepOutput:
     def __post_init__(self) -> None:
         """Raises `TypeError` if a field, perhaps of an engine of another package, is no array with its dimensions."""
         vectors = (self.forces_n, self.features, *(() if self.attention is None else self.attention[:1]))
-        if not all(isinstance(vector, np.ndarray) and vector.ndim == 1 for vector in vectors):
+        kinds = {(one.ndim, one.dtype.kind) if isinstance(one, np.ndarray) else 0 for one in vectors}
+        if kinds != {(1, "f")}:
             raise TypeError(
-                "forces_n and features must be NumPy arrays of 1 dimension, attention of 2, or None"
+                "forces_n and features must be NumPy arrays of floats of 1 dimension, attention of 2, or None"
             )
 
 
