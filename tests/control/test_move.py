@@ -148,6 +148,13 @@ def test_jaws_that_friction_makes_slow_arrive_and_are_not_blocked(make_run, widt
     assert run.last.status.outcome == "moved"
 
 
+def test_jaws_that_stop_just_before_their_width_are_blocked(make_run):
+    stop_m = make_run().transmission.open_width_m - 2 * 0.02
+    run = make_run(plant={"contact_m": 1.0, "stops_m": (0.0, 0.02)}).move(stop_m - 0.002, 6.0)
+    assert run.last.status.outcome == "blocked"
+    assert f"stopped at {1e3 * run.last.status.width_m:.1f} mm" in run.reasons[-1]
+
+
 def test_slow_jaws_are_not_blocked(make_run):
     run = make_run(plant={**FAR, "friction_n": 0.5}, approach_speed_m_s=0.001).move(OPEN_M - 0.006, 0.005)
     assert run.until(has_ended).last.status.outcome == "moved"
@@ -259,6 +266,16 @@ def test_stop_during_a_move(make_run, on_fault):
     assert "refused 'move': stopped or in fault; request a release first" in run.texts
     assert run.go(4.0, "release").last.status.phase == "open"
     assert run.move(0.05).last.status.width_m == pytest.approx(0.05, abs=0.0005)
+
+
+@pytest.mark.parametrize(("width_m", "reverses"), [(0.09, False), (0.02, True)])
+def test_after_a_release_the_motor_force_rises_from_zero_only_if_the_jaws_reverse(
+    make_run, width_m, reverses
+):
+    run = make_run(plant={"x_m": 0.03, "jaw_m": 0.03, "contact_m": 1.0}).go(0.3, "release")
+    before_a = run.last.command.goal_current_a
+    run.move(width_m, 0.005)
+    assert (run.last.command.goal_current_a < 0.5 * before_a) == reverses
 
 
 def test_newer_move_pre_empts_an_older_one(make_run):

@@ -547,6 +547,15 @@ def test_vision_removes_the_rest_of_a_lowering(make_run):
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
 
+def test_new_targets_keep_what_the_approach_has_learned_of_friction(make_run):
+    run = make_run(plant={"friction_n": 0.6})
+    for i in range(100):
+        run.grasp(3.0 + i % 2, 0.05)
+        if run.last.status.phase == "contact":
+            break
+    assert run.last.estimate.friction_n == pytest.approx(0.6, abs=0.1)
+
+
 def test_new_target_in_contact_is_used(make_run):
     run = make_run().to_phase("contact").grasp(2.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
@@ -680,12 +689,14 @@ def test_at_fault_the_jaws_open_against_friction_that_has_grown(make_run):
     assert run.plant.x_m < 0.003
 
 
-def test_a_result_says_that_a_hot_servo_holds_less(make_run):
+@pytest.mark.parametrize(("temperature_c", "is_hot"), [(65.0, True), (40.0, False)])
+def test_a_result_says_that_a_hot_servo_holds_less(make_run, temperature_c, is_hot):
     run = make_run()
-    run.spoil = lambda _, servo: replace(servo, temperature_c=65.0)
+    run.spoil = lambda _, servo: replace(servo, temperature_c=temperature_c)
     run.grasp(4.0)
     assert run.last.status.outcome == "held"
-    assert any(reason.endswith("reduced from 4 N because the servo is hot") for reason in run.reasons)
+    reduced = "reduced from 4 N because the servo is hot"
+    assert any(reason.endswith(reduced) for reason in run.reasons) == is_hot
 
 
 def test_hot_servo_holds_less_and_reports_it(make_run):
@@ -913,3 +924,9 @@ def test_a_grasp_without_a_good_end_teaches_nothing(make_run, end):
         run.go(0.05, end)
     run.go(2.0, "release")
     assert run.controller.end_grasps() is None
+
+
+def test_a_stopped_grasp_after_a_good_one_teaches_nothing(make_run):
+    once, twice = (make_run(vision={"gain": 0.5}).grasp(3.0).go(2.0, "release") for _ in range(2))
+    twice.grasp(4.0).go(0.05, "stop").go(2.0, "release")
+    assert twice.controller.end_grasps() == once.controller.end_grasps()

@@ -513,8 +513,9 @@ def test_an_error_that_the_caller_handled_still_ends_as_a_fault(quick: list[str]
             with pytest.raises(gf.DeviceTimeoutError):
                 gripper.step()
             bus().tamper = None
-            with pytest.raises(gf.DeviceTimeoutError):
-                gripper.grasp(2.0)  # a failed run stays failed
+            for wait in (True, False):  # a failed run stays failed
+                with pytest.raises(gf.DeviceTimeoutError):
+                    gripper.grasp(2.0, wait=wait)
         raise gf.DeviceError("reached: closing raised nothing")
     assert ended == [0]
 
@@ -726,6 +727,7 @@ def test_a_lost_device_is_raised_by_the_state_that_a_program_polls(
         while not gripper.state.outcome:
             time.sleep(0.01)
     values: list[Callable[[], object]] = [gripper.stop, lambda: gripper.force_n, lambda: gripper.frame]
+    values.append(lambda: gripper.release(wait=False))
     for value in values:
         with pytest.raises(gf.DeviceLostError):
             value()
