@@ -1,5 +1,17 @@
-"""``python -m gripper_force`` is the ``gripper-force`` command."""
+"""The entry point of ``gripper-force`` and ``python -m gripper_force``."""
 
-from gripper_force.cli import main
+import sys
+from typing import NoReturn
 
-main()
+
+def main() -> NoReturn:
+    """Runs the command line. Ctrl-C while it is imported, which takes a moment, ends it without a traceback."""
+    try:
+        from gripper_force.cli import main as run
+    except KeyboardInterrupt:
+        sys.exit(130)
+    run()
+
+
+if __name__ == "__main__":
+    main()

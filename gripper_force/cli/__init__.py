@@ -8,43 +8,37 @@ Ctrl-C.
 A command imports what it needs when it runs, so that ``gripper-force --help`` answers at once.
 """
 
+import errno
+import gc
+import json
+import os
+import signal
 import sys
+import warnings
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Annotated, NoReturn
 
-_INTERRUPTED = 130
+import typer
+from rich.markup import escape
 
-try:
-    import errno
-    import gc
-    import json
-    import os
-    import signal
-    import warnings
-    from io import TextIOWrapper
-    from pathlib import Path
-    from typing import Annotated, NoReturn
-
-    import typer
-    from rich.markup import escape
-
-    from gripper_force import __version__
-    from gripper_force.cli import (
-        bench,
-        calibrate,
-        configuration,
-        console,
-        data,
-        exports,
-        learning,
-        runs,
-        setup,
-        stability,
-        viewing,
-    )
-    from gripper_force.errors import GripperError
-    from gripper_force.plugins import importing
-    from gripper_force.runtime import process
-except KeyboardInterrupt:  # nothing has begun, so there is nothing to say
-    sys.exit(_INTERRUPTED)
+from gripper_force import __version__
+from gripper_force.cli import (
+    bench,
+    calibrate,
+    configuration,
+    console,
+    data,
+    exports,
+    learning,
+    runs,
+    setup,
+    stability,
+    viewing,
+)
+from gripper_force.errors import GripperError
+from gripper_force.plugins import importing
+from gripper_force.runtime import process
 
 app = typer.Typer(
     help="Gripper force control from camera images: run, calibrate, replay.",
@@ -73,6 +67,8 @@ app.add_typer(exports.app, name="export")
 app.add_typer(configuration.app, name="config")
 app.add_typer(bench.app, name="bench")
 app.add_typer(stability.app, name="stability")
+
+_INTERRUPTED = 130
 
 
 def main() -> NoReturn:

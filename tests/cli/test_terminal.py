@@ -164,7 +164,7 @@ def test_a_bar_without_a_step_is_not_beside_an_error(capsys: pytest.CaptureFixtu
 def test_ctrl_c_while_the_command_line_is_imported_ends_without_a_word(tmp_path: Path) -> None:
     (tmp_path / "typer.py").write_text("import signal; signal.raise_signal(signal.SIGINT)")
     path = os.pathsep.join([str(tmp_path), *sys.path])
-    command = [*COMMAND, "config", "show"]
+    command = [sys.executable, "-m", "gripper_force", "config", "show"]
     env = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
