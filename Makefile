@@ -13,7 +13,7 @@ TORCH := $(shell grep -om1 'torch>=[^"]*' pyproject.toml)
 # Tests of all lines of the safety monitor and the limits. `make test` runs them once, and counts the lines.
 COVERED := tests/control/test_safety.py tests/control/test_limits.py
 
-.PHONY: grasp test run-tests check-types test-docs test-lerobot docs wheel setup setup-dev format clean
+.PHONY: grasp test run-tests check-types test-docs test-lerobot test-lowest docs wheel setup setup-dev format clean
 
 grasp: setup
 	$(BIN)/gripper-force grasp $(ARGS)
@@ -49,6 +49,15 @@ test-lerobot:
 		lerobot==$(LEROBOT)
 	$(LEROBOT_VENV)/bin/pytest -m lerobot tests/jobs/exports integrations $(ARGS)
 
+# The tests with the oldest versions that pyproject.toml allows. Typer's warns of Click's newest.
+LOWEST_VENV := .venv-lowest
+test-lowest:
+	test -x $(LOWEST_VENV)/bin/pip || $(PYTHON) -m venv $(LOWEST_VENV)
+	$(PYTHON) scripts/lowest_versions.py > $(LOWEST_VENV)/lowest.txt
+	$(LOWEST_VENV)/bin/pip install --quiet --disable-pip-version-check --no-compile \
+		--editable '.[dev,engines,oak,report,sim,train]' --constraint $(LOWEST_VENV)/lowest.txt
+	OMP_NUM_THREADS=1 $(LOWEST_VENV)/bin/pytest -n auto -W ignore::DeprecationWarning $(ARGS)
+
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo open build/site/index.html
@@ -76,4 +85,4 @@ $(VENV)/installed-dev: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-lerobot-*
+	rm -rf $(VENV) .venv-*
