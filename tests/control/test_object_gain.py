@@ -117,15 +117,25 @@ def test_a_finished_grasp_and_a_known_ratio_are_the_same():
 def test_another_object_is_noticed_and_learned_anew():
     gain = ObjectGain(0.06)
     for _ in range(3):
-        hold(gain, 3.0, 3.0)
+        hold(gain, 3.0, 2.0)
         assert gain.finish_grasp(counts=True) == ""
-    hold(gain, 3.0, 1.5)
+    hold(gain, 3.0, 6.0)
     assert "another object" in gain.finish_grasp(counts=True)
-    assert ratio_of(gain) == pytest.approx(2.0)
+    assert ratio_of(gain) == pytest.approx(0.5)
+
+
+def test_a_better_grasp_after_a_weak_one_is_of_the_same_object():
+    gain = ObjectGain(0.06)
+    hold(gain, 0.4, 0.4)
+    gain.finish_grasp(counts=True)
+    assert ratio_of(gain) == pytest.approx(1.0)
+    hold(gain, 6.0, 4.8)
+    assert gain.finish_grasp(counts=True) == ""
+    assert ratio_of(gain) == pytest.approx(1.25, abs=0.01)
 
 
 def test_a_ratio_that_no_object_explains_is_a_problem():
-    for ratio in (0.5, 1.0, 2.0):
+    for ratio in (0.35, 1.0, 3.0):
         assert learned(0.06, [(ratio, 0.05)]).problem == ""
     assert "4.50 times" in learned(0.06, [(4.5, 0.05)]).problem
     assert learned(0.06, [(0.2, 0.05)]).problem
