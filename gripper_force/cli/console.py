@@ -61,14 +61,19 @@ def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Bar]":
     note = TextColumn("{task.fields[note]}", markup=False)
     shown = ProgressBar(*columns, note, console=err, disable=hidden, speed_estimate_period=_SPEED_S)
     running = Bar(shown, shown.add_task(label, total=total, note=""))
-    shown.start()
+    if err.is_terminal:  # elsewhere it is printed once, at its end
+        shown.start()
     try:
         yield running
     except Exception:
         shown.live.transient = not running.has_done  # the input is wrong, and the error says all
         raise
     finally:
-        shown.live.stop() if shown.live.transient else shown.stop()
+        if hidden or shown.live.transient:
+            shown.live.stop()
+        else:
+            shown.start()
+            shown.stop()
 
 
 def bar_or_lines(label: str, total: int) -> "AbstractContextManager[Progress]":
