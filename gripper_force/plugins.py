@@ -128,8 +128,9 @@ def wrong_result(result: Any, expected: str, now_ns: Callable[[], int] | None = 
     Args:
         result: The result. The fields of a record and the items of a list are checked, too.
         expected: Names of the types that it may have.
-        now_ns: Returns the time on the run's clock; None: times are not compared with it. A time that is further from
-            it than 10 s is of another clock, or in another unit.
+        now_ns: Returns the time on the run's clock; None: times are not compared with it. A time more than 10 s after
+            it is of another clock, and one below a thousandth of it in another unit. Others may be old: a program that
+            calls `Gripper.step` may pause.
     """
     own = ("builtins", "gripper_force.")  # another class may have the same name
     names = {base.__name__ for base in type(result).__mro__ if base.__module__.startswith(own)}
@@ -151,8 +152,10 @@ def wrong_result(result: Any, expected: str, now_ns: Callable[[], int] | None = 
             shown = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}"
             is_image = getattr(value, "dtype", "") == "uint8" and value.ndim == 2 and value.size
             problem = "" if is_image else "not an image, (H, W) uint8"
-        elif now_ns and field.name in ("t_ns", "received_ns") and abs(s := (value - now_ns()) / 1e9) > 10:
-            problem = f"{s:+.3g} s from the present: use the clock that the class gets, in nanoseconds"
+        elif now_ns and field.name in ("t_ns", "received_ns"):
+            now_s, at_s = now_ns() / 1e9, value / 1e9
+            if not (now_s - 1) / 1000 <= at_s <= now_s + 10:
+                problem = f"{at_s - now_s:+.3g} s from the present: use the clock that the class gets, in nanoseconds"
         elif field.name == "valid" and value and not math.isfinite(result.force_n):
             return f"a valid LoadCellSample whose force_n is {result.force_n}, which is not finite"
         if problem:

@@ -8,7 +8,8 @@ import pytest
 
 from gripper_force import plugins
 from gripper_force.errors import ConfigError
-from gripper_force.plugins import EXTRAS, load_class
+from gripper_force.plugins import EXTRAS, load_class, wrong_result
+from gripper_force.types import LoadCellSample
 
 BUILTIN = {"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"}
 
@@ -140,3 +141,24 @@ def test_a_third_party_object_can_be_copied(tmp_path: Path, monkeypatch: pytest.
     (tmp_path / "own_shape.py").write_text("class Shape:\n    sides = 3\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert copy(load("own_shape:Shape")()).sides == 3
+
+
+@pytest.mark.parametrize(
+    ("now_s", "at_s", "is_right"),
+    [
+        (0.0, 0.0, True),
+        (0.5, 0.0, True),  # the first frame of a simulation
+        (3600.0, 3601.0, True),
+        (3600.0, 1800.0, True),  # the program made a pause between two cycles
+        (3600.0, 3600e-9, False),  # seconds
+        (3600.0, 3600e-6, False),  # milliseconds
+        (3600.0, 1.8e9, False),  # seconds since 1970
+    ],
+)
+def test_a_time_of_another_clock_or_unit_is_told_from_an_old_one(
+    now_s: float, at_s: float, is_right: bool
+) -> None:
+    sample = LoadCellSample(round(1e9 * at_s), 1.0, 1.0)
+    problem = wrong_result([sample], "list", lambda: round(1e9 * now_s))
+    assert ("from the present: use the clock" in problem) is not is_right
+    assert bool(problem) is not is_right
