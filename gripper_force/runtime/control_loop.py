@@ -84,7 +84,7 @@ class ControlLoop:
     def request(self, request: PendingRequest) -> GraspResult | None:
         """Submits a request. Returns the result of an awaited one; where no thread runs the cycle, it does."""
         self._raise_error()
-        with self._own_cycle() if request.is_awaited and not self._background else contextlib.nullcontext():
+        with self._own_cycle() if request.is_awaited else contextlib.nullcontext():
             self._requests.submit(request)
             if not request.is_awaited:
                 return None
@@ -218,6 +218,10 @@ class ControlLoop:
 
     def _own_cycle(self) -> contextlib.ExitStack:
         """Lets only this thread run the control cycle: a second one would use the servo's port at the same time."""
+        if self in _cycles.get():
+            raise RequestError("a device can't wait for the control cycle that calls it; pass wait=False")
+        if self._background:
+            return contextlib.ExitStack()
         if not self._cycle_lock.acquire(blocking=False):
             raise RequestError(
                 "another thread runs the control cycle; pass wait=False, or use background=True"

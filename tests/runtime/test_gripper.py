@@ -1452,6 +1452,23 @@ def test_a_device_that_closes_its_own_gripper_ends_the_run_after_the_cycle(
     assert find_bus("rig") is None
 
 
+@pytest.mark.parametrize("background", [False, True])
+def test_a_device_can_not_wait_for_its_own_cycle(
+    simulated: Open, real_time: Open, monkeypatch: pytest.MonkeyPatch, background: bool
+) -> None:
+    gripper, cycle = real_time() if background else simulated(), Session.cycle
+
+    def with_grasp(session: Session, *request: Any, **named: Any) -> Any:
+        gripper.grasp(2.0)
+        return cycle(session, *request, **named)
+
+    monkeypatch.setattr(Session, "cycle", with_grasp)
+    with pytest.raises(
+        gf.RequestError, match=r"can't wait for the control cycle that calls it; pass wait=False$"
+    ):
+        gripper.sleep(20.0)
+
+
 def test_the_control_thread_may_close_its_gripper(
     real_time: Open, server: PtyServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
