@@ -142,24 +142,28 @@ def wrong_result(result: Any, expected: str, now_ns: Callable[[], int] | None = 
     if isinstance(result, list | tuple):
         return next(filter(None, (wrong_result(item, "LoadCellSample", now_ns) for item in result)), "")
     for field in fields(result) if is_dataclass(result) else ():
-        value, kind = getattr(result, field.name), getattr(field.type, "__name__", field.type)
-        problem, shown = "", ""
-        if kind == "float" and not isinstance(value, Real):
-            problem = "not a number"
-        elif kind == "int" and not _is_count(value):
-            problem = "not a whole number of 0 or more"
-        elif field.name == "gray":
-            shown = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}"
-            is_image = getattr(value, "dtype", "") == "uint8" and value.ndim == 2 and value.size
-            problem = "" if is_image else "not an image, (H, W) uint8"
-        elif now_ns and field.name in ("t_ns", "received_ns"):
-            now_s, at_s = now_ns() / 1e9, value / 1e9
-            if not (now_s - 1) / 1000 <= at_s <= now_s + 10:
-                problem = f"{at_s - now_s:+.3g} s from the present: use the clock that the class gets, in nanoseconds"
-        elif field.name == "valid" and value and not math.isfinite(result.force_n):
+        value, kind = getattr(result, field.name), str(getattr(field.type, "__name__", field.type))
+        if problem := _wrong_value(field.name, kind, value, now_ns):
+            return f"a {type(result).__name__} whose {field.name} is {problem}"
+        if field.name == "valid" and value and not math.isfinite(result.force_n):
             return f"a valid LoadCellSample whose force_n is {result.force_n}, which is not finite"
-        if problem:
-            return f"a {type(result).__name__} whose {field.name} is {shown.strip() or repr(value)[:60]}, {problem}"
+    return ""
+
+
+def _wrong_value(name: str, kind: str, value: Any, now_ns: Callable[[], int] | None) -> str:
+    """Returns the value of a record's field and what is wrong with it, or an empty text."""
+    if kind == "float" and not isinstance(value, Real):
+        return f"{value!r:.60}, not a number"
+    if kind == "int" and not _is_count(value):
+        return f"{value!r:.60}, not a whole number of 0 or more"
+    if name == "gray" and not (getattr(value, "dtype", "") == "uint8" and value.ndim == 2 and value.size):
+        image = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
+        return f"{image}, not an image, (H, W) uint8"
+    if now_ns and name in ("t_ns", "received_ns"):
+        now_s, at_s = now_ns() / 1e9, value / 1e9
+        if not (now_s - 1) / 1000 <= at_s <= now_s + 10:
+            remedy = "use the clock that the class gets, in nanoseconds"
+            return f"{value}, {at_s - now_s:+.3g} s from the present: {remedy}"
     return ""
 
 

@@ -99,7 +99,7 @@ def other_rig(header: "Header", logged: Config, *, is_profiled: bool) -> list[st
     Args:
         header: Header of the network.
         logged: Configuration of the log, with the region that is used now.
-        is_profiled: True if an object profile is used, which is of a rig of its own.
+        is_profiled: True if an object profile is used, whose rig is checked instead.
     """
     is_known = logged.gripper.nm_per_a is not None  # that of an imported recording is not
     return header.mismatches(logged.rig_settings()) if is_known and not is_profiled else []

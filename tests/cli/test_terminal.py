@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gripper_force import cli
 from gripper_force.cli import console
 
 COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
@@ -170,9 +169,13 @@ def test_ctrl_c_while_the_command_line_is_imported_ends_without_a_word(tmp_path:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
-def test_a_warning_of_the_library_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    cli._show_warning(RuntimeWarning("a device was not closed: it is [gone]"), RuntimeWarning, "file", 1)
-    assert capsys.readouterr().err == "warning: a device was not closed: it is [gone]\n"
+def test_a_warning_of_the_library_is_one_line() -> None:
+    program = (
+        "import warnings; from gripper_force import cli; "
+        "cli.app = lambda **_: warnings.warn('it is [gone]', RuntimeWarning); cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.stderr == "warning: it is [gone]\n"
 
 
 def test_without_a_terminal_a_bar_is_printed_once(folder: Path) -> None:
