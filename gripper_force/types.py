@@ -233,8 +233,8 @@ class Request:
         kind: A `RequestKind` value.
         target_n: Wanted grip force (grasp only).
         width_m: Wanted distance between the jaws (move only).
-        new_object: True if the object is another than in the grasps before (grasp only): the gain that was learned
-            is forgotten.
+        new_object: True if the camera sees another object than in the grasps before (grasp only): the newest frames
+            become the reference of vision, and the gain that was learned is forgotten.
     """
 
     t_ns: int

@@ -324,7 +324,7 @@ def network(
     set_: NoOverrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fit a network's out-of-distribution score and claimed errors to logs of what it knows."""
+    """Fit a network's out-of-distribution score, known views and claimed errors to logs of what it knows."""
     require("torch", "calibrate network")
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.training.ood_fit import calibrate_network

@@ -32,6 +32,7 @@ from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.estimator import claimed_std_n
 from gripper_force.vision.frame_checks import FrameChecks
+from gripper_force.vision.known_views import view_score
 from gripper_force.vision.ood import OodScore
 from gripper_force.vision.preprocess import downscale
 from gripper_hw.sim.kinds import held_out_kinds
@@ -329,6 +330,9 @@ def judge(
         forces_n[:, ~refused], read_out[~refused] = features(
             checkpoint.networks, header.preprocess, small[~refused]
         )
+    if header.views is not None:
+        reference = small[: header.preprocess.reference_frames].mean(0).round().astype(np.uint8)
+        refused |= view_score(header.views, reference) > 1
     estimate_n = forces_n.mean(0).astype(np.float64)
     std_n = claimed_std_n(header, forces_n)
     if header.ood is None:

@@ -130,8 +130,9 @@ class Gripper:
             force_n: Target force, in newtons: more than 0, at most 0.9 times ``control.force_limit_n`` over
                 ``gripper.gain_bound``, and at most what the profiles were calibrated with.
             wait: False returns at once; `state` shows the progress.
-            new_object: True if it is another object than in the grasps before: the gain that was learned of that
-                one is forgotten.
+            new_object: True if the camera sees another object than in the grasps before, or was moved since: the
+                newest frames become the reference of vision, and the gain that was learned is forgotten. The jaws must
+                not touch the object yet.
 
         Returns:
             The result once the outcome is known; None with ``wait=False``.

@@ -21,6 +21,9 @@ class Estimator(Protocol):
     def update(self, gray: Gray) -> ForceEstimate | None:
         """Takes the next frame; returns None while the reference is being collected."""
 
+    def renew_reference(self) -> None:
+        """Takes the last frames as the reference of the next ones."""
+
     def attention_map(self) -> npt.NDArray[np.float32] | None:
         """Returns the attention over the newest frame, (h, w) in 0..1, or None."""
 
@@ -49,6 +52,11 @@ class FrameProcessor:
         self._works = False
         self._last: Gray | None = None
         self._may_repeat: bool | None = None  # unknown
+        self._renewal_ns: int | None = None
+
+    def renew_reference(self, t_ns: int) -> None:
+        """Makes the last frames up to a time the reference of those after it. They must show no contact."""
+        self._renewal_ns = t_ns
 
     def process(self, frame: Frame, now_ns: Callable[[], int] | None = None) -> ProcessedFrame:
         """Estimates the force in a frame.
@@ -70,6 +78,9 @@ class FrameProcessor:
             return ProcessedFrame(frame, None, "the camera repeats its last image; check whether it hangs")
         begin_ns, problem = time.perf_counter_ns(), ""
         try:
+            if self._renewal_ns is not None and frame.t_ns > self._renewal_ns:
+                self._renewal_ns = None
+                self._estimator.renew_reference()
             result = self._estimator.update(frame.gray)
         except Exception as error:
             if not self._works:
@@ -121,6 +132,10 @@ class LockstepPerception:
             ready.append(self._under_way.popleft()[1])
         return ready
 
+    def renew_reference(self, t_ns: int) -> None:
+        """Renews the reference, see `FrameProcessor.renew_reference`."""
+        self._processor.renew_reference(t_ns)
+
     def close(self) -> None:
         """Has no effect: there is no thread."""
 
@@ -148,6 +163,10 @@ class ThreadedPerception:
         if self._failure is not None:
             raise self._failure
         return [self._done.popleft() for _ in range(len(self._done))]
+
+    def renew_reference(self, t_ns: int) -> None:
+        """Renews the reference, see `FrameProcessor.renew_reference`."""
+        self._processor.renew_reference(t_ns)
 
     def close(self) -> None:
         """Stops the thread; gives up after 1 s if the estimator hangs. May be called twice."""

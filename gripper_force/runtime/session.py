@@ -235,6 +235,8 @@ class Session:
         for record in (*inputs, decision.estimate, decision.command, decision.status, *decision.events):
             self._log(record)
         self._log_sensors(state.t_ns)
+        if request is not None and request.new_object and not decision.refusal:
+            self._perception.renew_reference(state.t_ns)
         return decision
 
     def _poll_perception(self) -> VisualForce | None:

@@ -1,6 +1,7 @@
 """Force estimator: camera frames in, contact force and its claimed error out."""
 
 import math
+from collections import deque
 from pathlib import Path
 from typing import Self
 
@@ -16,6 +17,7 @@ from gripper_force.types import ForceEstimate, Gray
 from gripper_force.vision.engines import Engine, Floats, Precision, StepOutput, open_engine
 from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Model
+from gripper_force.vision.known_views import view_score
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.ood import OodScore
 from gripper_force.vision.preprocess import Normaliser, Region, downscale
@@ -34,6 +36,9 @@ class ForceEstimator:
     grows with the frame's out-of-distribution score. It grows with the distance to the forces seen in
     validation or calibration. The limits of that score are the object profile's, if it has some, and otherwise the
     checkpoint's.
+
+    Without a profile, the reference itself must be like the views that the network knows: a profile is of an object
+    and a view that its user chose.
     """
 
     def __init__(
@@ -57,8 +62,10 @@ class ForceEstimator:
         self._preprocess, members = engine.header.preprocess, engine.header.members
         self._sizes = len(members), sum(member.head for member in members)
         self._correction = correction
+        self._last: deque[Gray] = deque(maxlen=self._preprocess.reference_frames)
         own = None if correction is None else correction.known
         self._ood = None if engine.header.ood is None else OodScore(engine.header.ood, own)
+        self._views = engine.header.views if correction is None else None
         self.reset()
 
     @classmethod
@@ -122,7 +129,20 @@ class ForceEstimator:
         if self._ood is not None:
             self._ood.reset()
         self._attention: Floats | None = None
+        self._view_score: float | None = None
         self._shape: tuple[int, ...] | None = None  # None: no frame so far
+
+    def renew_reference(self) -> None:
+        """Starts a new stream whose reference is the last frames: of another object, or from a camera that was moved.
+
+        They must show no contact.
+
+        Raises:
+            DataError: The last frames are flat.
+        """
+        self.reset()
+        for small in self._last:
+            self._steps(small)
 
     @property
     def reference(self) -> Gray | None:
@@ -142,7 +162,8 @@ class ForceEstimator:
             DataError: The frame is not a gray image of bytes, has another size than the frames before it, or is
                 implausible (see `FrameChecks`).
             UnfamiliarFrameError: The frame's out-of-distribution score exceeds the limit of the object profile or
-                of the checkpoint, or the view is covered or blurred (see `FrameChecks`).
+                of the checkpoint, the network does not know the view before the contact, or the view is covered or
+                blurred (see `FrameChecks`).
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network returned NaN or infinity.
         """
@@ -151,10 +172,15 @@ class ForceEstimator:
         if self._shape not in (None, gray.shape):
             remedy = "keep the camera's resolution, or start a new stream"
             raise DataError(f"the frame is {gray.shape}, but the stream began with {self._shape}; {remedy}")
-        self._frame_checks.check(small)
+        self._last.append(small)
+        steps = self._steps(small)
         self._shape = gray.shape
-        steps = [self._engine.step(frame) for frame in self._normaliser.push(small)]
         return self._estimate(steps[-1]) if steps else None
+
+    def _steps(self, small: Gray) -> list[StepOutput]:
+        """Returns the networks' outputs for the frames that became ready with the next one, (S, S)."""
+        self._frame_checks.check(small)
+        return [self._engine.step(frame) for frame in self._normaliser.push(small)]
 
     def _estimate(self, step: StepOutput) -> ForceEstimate:
         """Returns the estimate for the networks' output."""
@@ -165,6 +191,15 @@ class ForceEstimator:
         if not all(math.isfinite(force) for force in forces):
             raise NonFiniteError(f"the network returned {forces} N; check the checkpoint and the image")
         force_n = sum(forces) / len(forces)
+        if self._views is not None and (reference := self.reference) is not None:
+            if self._view_score is None:
+                self._view_score = view_score(self._views, reference)
+            if self._view_score > 1:
+                raise UnfamiliarFrameError(
+                    f"the view before the contact is unlike those that the network knows ({self._view_score:.2f} times "
+                    "the limit): another object, view or background; calibrate the object, or train a network with it",
+                    force_n,
+                )
         features, score = step.features[None], 0.0  # (1, F)
         if self._ood is not None:
             score = float(self._ood.score(features, np.array([force_n]))[0])

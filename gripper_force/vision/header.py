@@ -165,6 +165,30 @@ class OodModel(Section):
     std_growth: NonNegative
 
 
+VIEW_LENGTH: Final = 648
+"""Numbers that describe a view, see `gripper_force.vision.known_views`."""
+
+
+class KnownViews(Section):
+    """Model of the views before a contact that a network knows (see `gripper_force.vision.known_views`).
+
+    Attributes:
+        mean: Mean description, (`VIEW_LENGTH`,) float32.
+        axes: Orthonormal basis of the subspace near which descriptions lie, (`VIEW_LENGTH`, R) float16.
+        limit: Largest squared distance from the subspace.
+    """
+
+    mean: Base64UrlBytes
+    axes: Base64UrlBytes
+    limit: Positive
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if len(self.mean) != 4 * VIEW_LENGTH or not self.axes or len(self.axes) % (2 * VIEW_LENGTH):
+            raise ValueError(f"views.mean and views.axes do not have {VIEW_LENGTH} rows")
+        return self
+
+
 class Header(Section):
     """Metadata of a checkpoint.
 
@@ -176,6 +200,7 @@ class Header(Section):
         metrics: Metrics on the validation data, such as ``mae_n``; ``constant_mae_n`` is that of the mean force
             of the training data, for comparison.
         ood: Model for the out-of-distribution score; None in checkpoints of earlier versions.
+        views: Views before a contact that the network knows; None if too few were compared.
         test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
             training's own validation data. Metrics of two checkpoints compare if it is the same.
         identity: SHA-256 of the file before its header was changed; see `digest_of`.
@@ -188,6 +213,7 @@ class Header(Section):
     data_digest: str
     metrics: dict[str, float]
     ood: OodModel | None = None
+    views: KnownViews | None = None
     test_digest: str = ""
     identity: str = ""
     trained_on: Tree | None = None

@@ -58,6 +58,10 @@ class FaultyEstimator:
         self._estimator, self._faults, self._clock, self._lockstep = estimator, faults, clock, lockstep
         self._calls = 0
 
+    def renew_reference(self) -> None:
+        """Renews the reference of the wrapped estimator."""
+        self._estimator.renew_reference()
+
     def attention_map(self) -> Any:
         """Returns the attention map of the wrapped estimator."""
         return self._estimator.attention_map()

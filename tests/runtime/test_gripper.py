@@ -1,4 +1,5 @@
 import asyncio
+import dataclasses
 import gc
 import math
 import re
@@ -23,6 +24,7 @@ from hypothesis import strategies as st
 import gripper_force as gf
 from gripper_force.control import state_machine
 from gripper_force.control.limits import largest_target_n
+from gripper_force.jobs.replay import replay
 from gripper_force.runtime import control_loop, process, session
 from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.log_reader import LogReader
@@ -226,6 +228,8 @@ class LoadCellEstimator:
         force_n = None if self.gripper is None else self.gripper.state.load_cell_n
         return gf.ForceEstimate(self.share * (force_n or 0.0), 0.1)
 
+    def renew_reference(self) -> None: ...
+
     def attention_map(self) -> None:
         return None
 
@@ -266,6 +270,37 @@ def test_a_new_object_begins_without_the_gain_of_the_one_before(
     assert gripper.grasp(3.0).vision_share > 0.9
     gripper.release()
     assert gripper.grasp(3.0, new_object=True).vision_share == 0
+
+
+@pytest.mark.parametrize("new_object", [False, True])
+def test_vision_takes_a_new_reference_with_a_new_object(
+    quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new_object: bool
+) -> None:
+    """Between two grasps an arm has moved the camera: the image is shifted by three pixels."""
+    moved = False
+    newest = rig.SimulatedCamera.newest
+
+    def shifted(self: rig.SimulatedCamera) -> gf.Frame | None:
+        frame = newest(self)
+        if frame is None or not moved:
+            return frame
+        return dataclasses.replace(frame, gray=np.roll(frame.gray, 3, axis=1))
+
+    monkeypatch.setattr(rig.SimulatedCamera, "newest", shifted)
+    seeing = [
+        "camera.backend=simulated",
+        "vision.checkpoint=small",
+        "control.feedback=fused",
+    ]
+    log = tmp_path / "two.mcap"
+    with gf.open_gripper(overrides=[*quick, *seeing], log=log) as gripper:
+        assert gripper.grasp(3.0).vision_share > 0.9
+        gripper.release()
+        moved = True
+        gripper.sleep(0.2)
+        share = gripper.grasp(3.0, new_object=new_object).vision_share
+    assert share > 0.9 if new_object else share == 0
+    assert replay(log).identical
 
 
 def test_a_camera_without_reference_frames_is_an_error_before_the_first_motion(

@@ -25,6 +25,9 @@ class FakeEstimator:
             raise self.error
         return ForceEstimate(float(self.count), 0.5) if self.count > self.references else None
 
+    def renew_reference(self) -> None:
+        self.count = self.references
+
     def attention_map(self) -> np.ndarray | None:
         return np.array([[0.2, 0.4], [0.5, 0.7]], np.float32) + 0.001 * self.count
 
@@ -64,6 +67,21 @@ class Shutter:
 
 def seqs(seen: list[ProcessedFrame]) -> list[int]:
     return [s.frame.seq for s in seen]
+
+
+def test_a_reference_is_renewed_before_the_first_frame_after_the_request() -> None:
+    clock, camera = Hand(), Shutter()
+    perception = LockstepPerception(camera, FakeEstimator(references=0), clock, compute_ms=0.0)
+    forces_n = []
+    for seq in range(6):
+        if seq == 3:  # frame 3 was captured at 60 ms, before the request
+            perception.renew_reference(65 * NS_PER_MS)
+        camera.give(seq, 20 * seq)
+        clock.now_ms = 20 * seq + 10
+        (seen,) = perception.poll()
+        assert seen.visual is not None
+        forces_n.append(seen.visual.force_n)
+    assert forces_n == [1, 2, 3, 4, 1, 2]
 
 
 def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> None:

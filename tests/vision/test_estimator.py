@@ -1,5 +1,6 @@
 import math
 from base64 import urlsafe_b64encode
+from contextlib import suppress
 from dataclasses import replace
 from datetime import date
 from hashlib import sha256
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from gripper_force.config import VisionConfig
-from gripper_force.errors import ConfigError, DataError, NonFiniteError
+from gripper_force.errors import ConfigError, DataError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.jobs.profile_files import pack, write_object
 from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays
 from gripper_force.profiles.object_profile import Interval, ObjectProfile, OodLimit, OutputCurve
@@ -20,7 +21,16 @@ from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.engines import pytorch
 from gripper_force.vision.estimator import ForceEstimator, open_estimator
-from gripper_force.vision.header import Header, Model, NetworkConfig, OodModel, Residual
+from gripper_force.vision.header import (
+    VIEW_LENGTH,
+    Header,
+    KnownViews,
+    Model,
+    NetworkConfig,
+    OodModel,
+    Residual,
+)
+from gripper_force.vision.known_views import describe_view
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess, Region, downscale
@@ -251,6 +261,53 @@ def test_a_network_without_a_score_rejects_no_frame(frames: np.ndarray) -> None:
     assert run(estimator, frames)[-1] is not None
 
 
+def test_a_view_that_the_network_does_not_know_gives_no_estimate(frames: np.ndarray) -> None:
+    def knowing(view: np.ndarray) -> Checkpoint:
+        known = KnownViews(
+            mean=urlsafe_b64encode(describe_view(view).astype(np.float32).tobytes()),
+            axes=urlsafe_b64encode(np.eye(VIEW_LENGTH, 1, dtype=np.float16).tobytes()),
+            limit=1e-3,
+        )
+        bare = ensemble("ssam")
+        return replace(bare, header=bare.header.model_copy(update={"views": known}))
+
+    plain = ForceEstimator(engine(ensemble("ssam")), REGION)
+    expected = run(plain, frames)
+    assert plain.reference is not None
+    assert run(ForceEstimator(engine(knowing(plain.reference)), REGION), frames) == expected
+    other = knowing(np.ascontiguousarray(plain.reference[::-1]))
+    unknown = ForceEstimator(engine(other), REGION)
+    assert run(unknown, frames[:3]) == [None] * 3
+    for frame, estimate in zip(frames[3:], expected[3:], strict=True):
+        with pytest.raises(UnfamiliarFrameError, match="before the contact is unlike those") as caught:
+            unknown.update(frame)
+        assert estimate is not None
+        assert caught.value.force_n == estimate.force_n
+    own = ForceEstimator(engine(other), REGION, correction(1e6, np.zeros(7, np.float32)))
+    assert run(own, frames)[-1] is not None, "the user of a profile has chosen the view"
+
+
+def test_a_renewed_reference_is_that_of_the_last_frames(frames: np.ndarray) -> None:
+    moved = np.roll(frames, 9, axis=2)  # the camera was moved by so many pixels
+    large = ensemble("ssam")
+    renewed, fresh = (ForceEstimator(engine(large), REGION) for _ in range(2))
+    run(renewed, frames[:10])
+    run(renewed, moved[:10])
+    renewed.renew_reference()
+    run(fresh, moved[6:10])
+    assert renewed.reference is not None
+    assert fresh.reference is not None
+    assert np.array_equal(renewed.reference, fresh.reference)
+    assert run(renewed, moved[10:]) == run(fresh, moved[10:])
+
+
+def test_a_reference_that_is_renewed_at_once_takes_the_next_frames(frames: np.ndarray) -> None:
+    estimator, fresh = (ForceEstimator(engine(ensemble("ssam")), REGION) for _ in range(2))
+    run(estimator, frames[:2])
+    estimator.renew_reference()
+    assert run(estimator, frames[2:]) == run(fresh, frames)[2:]
+
+
 def test_loads_a_network_by_name_or_path(tiny_checkpoint: Path, frames: np.ndarray) -> None:
     estimator = ForceEstimator.load(tiny_checkpoint, region=REGION)
     expected = open_estimator(read_model(tiny_checkpoint), VisionConfig(region=REGION))
@@ -332,7 +389,11 @@ def test_jaws_that_hide_more_of_the_view_are_configured(max_covered: float) -> N
         ForceEstimator.load("small", max_covered=max_covered),
     ):
         *first, last = covered_frames()
-        run(estimator, np.stack(first))
+        for frame in first:
+            with suppress(
+                UnfamiliarFrameError
+            ):  # the network does not know this scene, which is no matter here
+                estimator.update(frame)
         try:
             estimator.update(last)
         except DataError as error:

@@ -195,7 +195,10 @@ class _Feed:
             del self._pending[next(iter(self._pending))]
 
     def _decide(self, controller: GraspController, state: ServoState) -> None:
-        decision = controller.step(state.t_ns, state, self._newest, self._request)
+        request = self._request
+        decision = controller.step(state.t_ns, state, self._newest, request)
+        if request is not None and request.new_object and not decision.refusal:
+            self._processor.renew_reference(state.t_ns)
         self._newest = self._request = None
         self._sink.add_decision(decision)
         self._commands.add_replayed(decision.command)

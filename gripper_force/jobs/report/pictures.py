@@ -1,6 +1,7 @@
 """Camera frames over a grasp, with the network's spatial attention over them."""
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -10,10 +11,11 @@ import numpy.typing as npt
 from matplotlib import colormaps
 
 from gripper_force.config import config_from_text
+from gripper_force.control.state_machine import refused_ns
 from gripper_force.errors import CheckpointError, DataError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.jobs.report.run import Run
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.types import GRIPPING, NS_PER_S, Frame, Gray
+from gripper_force.types import GRIPPING, NS_PER_S, Event, Frame, Gray, Request
 from gripper_force.vision.preprocess import downscale
 
 if TYPE_CHECKING:
@@ -104,6 +106,9 @@ class FrameSampler:
         self._region = config.vision.region
         used = log.metadata.get("checkpoint", "")
         self._estimator, self._note = _open_estimator(config, used, any_checkpoint=changed is not None)
+        refused = refused_ns(log.records(Event)) if self._estimator is not None else set()
+        requests = log.records(Request) if self._estimator is not None else ()
+        self._renewals_ns = deque(r.t_ns for r in requests if r.new_object and r.t_ns not in refused)
         self._kept: list[_Candidate] = []
         self._step = 1
         self._count = 0
@@ -120,6 +125,9 @@ class FrameSampler:
             # not see it, and the newest attention is that of an earlier frame.
             seen = True
             try:
+                if self._renewals_ns and frame.t_ns > self._renewals_ns[0]:
+                    self._renewals_ns.popleft()
+                    self._estimator.renew_reference()
                 self._estimator.update(frame.gray)
             except UnfamiliarFrameError as error:
                 seen = math.isfinite(error.force_n)

@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, without_contact_starts
 from gripper_force.jobs.known_frames import EDGES_N, fit_subspace, smooth_ratios, typical_shares
+from gripper_force.jobs.training.view_fit import fit_views
 from gripper_force.profiles.correction import KnownFrames
 from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.progress import Progress, no_progress
@@ -19,7 +20,7 @@ from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.checkpoint_writer import check_place, replace_header
 from gripper_force.vision.estimator import claimed_std_n
-from gripper_force.vision.header import Header, OodModel, read_checkpoint
+from gripper_force.vision.header import Header, KnownViews, OodModel, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.ood import residual_share
 
@@ -129,18 +130,20 @@ def model_of_scores(
     )
 
 
-def add_ood(source: str | Path, model: OodModel, out: Path) -> None:
-    """Writes a checkpoint with a fitted model. The weights and the digest stay.
+def add_ood(source: str | Path, model: OodModel, views: KnownViews | None, out: Path) -> None:
+    """Writes a checkpoint with fitted models. The weights and the digest stay.
 
     Args:
         source: Path or name of the checkpoint.
-        model: The model.
+        model: Model of the out-of-distribution score.
+        views: Views that the network knows; None leaves those of the checkpoint.
         out: Checkpoint to write; it may be the same file.
 
     Raises:
         CheckpointError: The checkpoint can't be read or written.
     """
-    replace_header(source, read_checkpoint(source)[2].model_copy(update={"ood": model}), out)
+    header = read_checkpoint(source)[2]
+    replace_header(source, header.model_copy(update={"ood": model, "views": views or header.views}), out)
 
 
 def calibrate_network(
@@ -151,7 +154,7 @@ def calibrate_network(
     workers: int = 1,
     progress: Progress = no_progress,
 ) -> OodModel:
-    """Fits a checkpoint's out-of-distribution score and claimed deviation to logs, and writes the checkpoint.
+    """Fits a checkpoint's out-of-distribution score, known views and claimed deviation to logs, and writes it.
 
     Args:
         logs: Logs that the checkpoint was not trained on, of the kinds of objects and scenes it knows. Logs that
@@ -177,7 +180,7 @@ def calibrate_network(
             f"a score needs at least {MIN_LOGS} logs that show contact and were not trained on, of at least {FOLDS} "
             "sets; simulate or record more"
         )
-    add_ood(source, model, out)
+    add_ood(source, model, fit_views(clips, preprocess), out)
     return model
 
 

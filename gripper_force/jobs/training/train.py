@@ -26,6 +26,7 @@ from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.stated_errors import errors, labelled_estimates, residuals
 from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.jobs.training.view_fit import fit_views
 from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
@@ -181,7 +182,7 @@ def _add_ood(
     warn: Callable[[str], None],
 ) -> None:
     if (ood := fit_ood(networks, read_checkpoint(out)[2], clips, device)) is not None:
-        add_ood(out, ood, out)
+        add_ood(out, ood, None, out)
     else:
         warn(
             f"the checkpoint has no out-of-distribution score, which needs {MIN_LOGS} validation logs of {FOLDS} sets "
@@ -227,6 +228,7 @@ def _save(
         residuals=residuals(forces_n, measured_n),
         data_digest=digest(clips),
         trained_on=trained_on(clips),
+        views=fit_views(clips, config.preprocess),
         metrics={
             **errors(forces_n, measured_n),
             "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),

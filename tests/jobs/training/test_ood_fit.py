@@ -29,7 +29,7 @@ def test_score_of_known_logs_is_below_the_limit_and_the_digest_stays(
     model = fit_ood(before.force_networks, before.header, clips_of_32)
     assert model is not None
     out = tmp_path / "scored.safetensors"
-    add_ood(tiny_checkpoint, model, out)
+    add_ood(tiny_checkpoint, model, None, out)
     after = load_checkpoint(out)
     assert after.digest == before.digest
     assert after.header.ood == model

@@ -1,0 +1,60 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.training.ood_fit import calibrate_network
+from gripper_force.jobs.training.view_fit import MIN_VIEWS, fit_views
+from gripper_force.types import Gray
+from gripper_force.vision.header import read_checkpoint
+from gripper_force.vision.known_views import view_score
+from gripper_force.vision.preprocess import Preprocess
+
+
+def picture(seed: int, *, disc: bool = False) -> Gray:
+    """A square or a disc of a random size and place before a random background."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:64, :64] - rng.uniform(28, 36, 2)[:, None, None]
+    radius = rng.uniform(14, 18)
+    inside = np.hypot(x, y) < radius if disc else np.maximum(abs(x), abs(y)) < radius
+    image: Gray = (rng.normal(70, 5, (64, 64)) + rng.uniform(60, 90) * inside).clip(0, 255).astype(np.uint8)
+    return image
+
+
+def clips_of(press: Callable[..., Clip], count: int) -> list[Clip]:
+    clip = press(0)
+    return [
+        replace(clip, frames=np.repeat(picture(i)[None], 8, axis=0), set=f"s{i}", name=f"c{i}")
+        for i in range(count)
+    ]
+
+
+def test_known_shapes_are_within_the_limit_and_others_are_not(press: Callable[..., Clip]) -> None:
+    views = fit_views(clips_of(press, 3 * MIN_VIEWS), Preprocess(size=64))
+    assert views is not None
+    known = [view_score(views, picture(1000 + i)) for i in range(40)]
+    unknown = [view_score(views, picture(2000 + i, disc=True)) for i in range(40)]
+    assert np.mean(np.array(known) > 1) <= 0.05
+    assert np.mean(np.array(unknown) > 1) > 0.95
+
+
+def test_a_view_needs_a_reference_and_many_sets(press: Callable[..., Clip]) -> None:
+    clips = clips_of(press, MIN_VIEWS)
+    assert fit_views(clips, Preprocess(size=64)) is not None
+    assert fit_views(clips[1:], Preprocess(size=64)) is None
+    assert fit_views(clips, Preprocess(size=64, reference=False)) is None
+    again = [replace(clip, name=f"{clip.name} again") for clip in clips[1:]]
+    assert fit_views([*clips[1:], *again], Preprocess(size=64)) is None, "two logs of a set show one view"
+
+
+def test_calibrate_network_keeps_the_views_of_a_checkpoint_if_the_logs_show_few(
+    press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
+) -> None:
+    before = read_checkpoint("small")[2].views
+    logs = [write_log(press(seed), tmp_path) for seed in range(12)]
+    out = tmp_path / "out.safetensors"
+    calibrate_network(logs, out, "small")
+    assert before is not None
+    assert read_checkpoint(out)[2].views == before
