@@ -41,6 +41,7 @@ from gripper_force.types import (
     LoadCellSample,
     Record,
     Request,
+    RequestKind,
     ServoCommand,
     ServoState,
     VisualForce,
@@ -490,6 +491,24 @@ def test_a_frame_whose_estimate_is_not_finite_has_no_attention(
     assert [kept.attention for kept in sampler._kept] == [None] * 3
 
 
+@pytest.mark.parametrize("refused", [False, True])
+def test_attention_follows_a_new_object_unless_it_was_refused(
+    grasp: Path, monkeypatch: pytest.MonkeyPatch, refused: bool
+) -> None:
+    log = LogReader(grasp)
+    sampler, before = FrameSampler(log), []
+    frames = list(islice(log.records(Frame), 20))
+    monkeypatch.setattr(ForceEstimator, "renew_reference", lambda _: before.append(len(sampler._kept)))
+    for i, frame in enumerate(frames):
+        if i == 10:
+            now_ns = frames[10].t_ns  # frame 10 was on its way
+            sampler.add(Request(now_ns, RequestKind.GRASP, 3.0, new_object=True))
+            if refused:
+                sampler.add(Event(now_ns, "control", "refused 'grasp': an object is held"))
+        sampler.add(frame)
+    assert before == ([] if refused else [11])
+
+
 def test_frames_of_recording_span_its_touch(tmp_path: Path) -> None:
     path = tmp_path / "egg.mcap"
     with LogWriter(path, config="", metadata={}) as log:
@@ -512,8 +531,8 @@ def test_long_log_keeps_few_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     sampler = FrameSampler(reader)
     kept = []
 
-    def add(frame: Frame) -> None:
-        sampler.add(frame)
+    def add(record: Record) -> None:
+        sampler.add(record)
         kept.append(len(sampler._kept))
 
     shown, _ = sampler.pictures(read_run(reader, add))

@@ -1,7 +1,6 @@
 """Camera frames over a grasp, with the network's spatial attention over them."""
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -15,7 +14,7 @@ from gripper_force.control.state_machine import refused_ns
 from gripper_force.errors import CheckpointError, DataError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.jobs.report.run import Run
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.types import GRIPPING, NS_PER_S, Event, Frame, Gray, Request
+from gripper_force.types import GRIPPING, NS_PER_S, Event, Frame, Gray, Record, Request
 from gripper_force.vision.preprocess import downscale
 
 if TYPE_CHECKING:
@@ -106,27 +105,33 @@ class FrameSampler:
         self._region = config.vision.region
         used = log.metadata.get("checkpoint", "")
         self._estimator, self._note = _open_estimator(config, used, any_checkpoint=changed is not None)
-        refused = refused_ns(log.records(Event)) if self._estimator is not None else set()
-        requests = log.records(Request) if self._estimator is not None else ()
-        self._renewals_ns = deque(r.t_ns for r in requests if r.new_object and r.t_ns not in refused)
+        self._renewal_ns: int | None = None
         self._kept: list[_Candidate] = []
         self._step = 1
         self._count = 0
 
-    def add(self, frame: Frame) -> None:
-        """Takes the next frame of the log.
+    def add(self, record: Record) -> None:
+        """Takes the log's next record.
 
         Raises:
             ConfigError: The region of interest reaches beyond the frame.
         """
+        if isinstance(record, Request) and record.new_object:
+            self._renewal_ns = record.t_ns
+        elif isinstance(record, Event) and self._renewal_ns in refused_ns([record]):
+            self._renewal_ns = None
+        elif isinstance(record, Frame):
+            self._add_frame(record)
+
+    def _add_frame(self, frame: Frame) -> None:
         attention = None
         if self._estimator is not None:
             # The run continued without an estimate for such a frame, too. If the checks rejected it, the network did
             # not see it, and the newest attention is that of an earlier frame.
             seen = True
             try:
-                if self._renewals_ns and frame.t_ns > self._renewals_ns[0]:
-                    self._renewals_ns.popleft()
+                if self._renewal_ns is not None and frame.t_ns > self._renewal_ns:
+                    self._renewal_ns = None
                     self._estimator.renew_reference()
                 self._estimator.update(frame.gray)
             except UnfamiliarFrameError as error:

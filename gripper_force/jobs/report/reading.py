@@ -34,6 +34,7 @@ from gripper_force.types import (
     LoadCellSample,
     Outcome,
     Phase,
+    Record,
     Request,
     RequestKind,
     ServoCommand,
@@ -65,7 +66,7 @@ _BETWEEN_TOUCHES_S: Final = 0.2
 
 def read_run(
     log: LogReader,
-    on_frame: Callable[[Frame], None] = lambda frame: None,
+    on_record: Callable[[Record], None] = lambda record: None,
     replayed: Replayed | None = None,
     config: Config | None = None,
 ) -> Run:
@@ -73,7 +74,7 @@ def read_run(
 
     Args:
         log: Log of a run or of a recording.
-        on_frame: Called with each frame while the log is read. Frames are not kept.
+        on_record: Called with each record while the log is read. Frames are not kept.
         replayed: Estimates and decisions of a replay, which replace those of the log.
         config: Configuration of that replay.
 
@@ -81,7 +82,7 @@ def read_run(
         LogError: The log can't be read.
         ConfigError: The log holds a configuration that this version does not understand.
     """
-    records, ages_ns = _records(log, on_frame)
+    records, ages_ns = _records(log, on_record)
     logged_status = records[GraspStatus]
     if replayed is not None:
         _replace(records, replayed)
@@ -132,14 +133,14 @@ def read_run(
     )
 
 
-def _records(log: LogReader, on_frame: Callable[[Frame], None]) -> tuple[dict[type, list[Any]], list[int]]:
+def _records(log: LogReader, on_record: Callable[[Record], None]) -> tuple[dict[type, list[Any]], list[int]]:
     """Returns all records but the frames by type, and each frame's age when it was received, in nanoseconds."""
     records: dict[type, list[Any]] = defaultdict(list)
     ages_ns = []
     for record in log.records(*_KINDS):
+        on_record(record)
         if isinstance(record, Frame):
             ages_ns.append(record.received_ns - record.t_ns)
-            on_frame(record)
         else:
             records[type(record)].append(record)
     return records, ages_ns
