@@ -331,9 +331,10 @@ def network(
 
     logs = find_logs(data)
     with console.bar("calibrating", 2 * len(logs)) as progress:
-        model = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
+        model, views = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
     fitted = model.model_dump(mode="json", exclude={"mean", "axes"})
-    console.show({"checkpoint": str(out), **fitted}, as_json, lambda _: output.network_table(str(out), model))
+    result = {"checkpoint": str(out), **fitted, "view_limit": None if views is None else views.limit}
+    console.show(result, as_json, lambda _: output.network_table(str(out), model, views))
     console.next_step("evaluate", data, "--checkpoint", out)
 
 

@@ -34,7 +34,7 @@ from gripper_force.vision.estimator import claimed_std_n
 from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.known_views import view_score
 from gripper_force.vision.ood import OodScore
-from gripper_force.vision.preprocess import downscale
+from gripper_force.vision.preprocess import downscale, mean_image
 from gripper_hw.sim.kinds import held_out_kinds
 
 FIRST_SEED: Final = 7_800_000
@@ -331,7 +331,7 @@ def judge(
             checkpoint.networks, header.preprocess, small[~refused]
         )
     if header.views is not None:
-        reference = small[: header.preprocess.reference_frames].mean(0).round().astype(np.uint8)
+        reference = mean_image(small[: header.preprocess.reference_frames])
         refused |= view_score(header.views, reference) > 1
     estimate_n = forces_n.mean(0).astype(np.float64)
     std_n = claimed_std_n(header, forces_n)

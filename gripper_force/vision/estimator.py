@@ -62,7 +62,6 @@ class ForceEstimator:
         self._preprocess, members = engine.header.preprocess, engine.header.members
         self._sizes = len(members), sum(member.head for member in members)
         self._correction = correction
-        self._last: deque[Gray] = deque(maxlen=self._preprocess.reference_frames)
         own = None if correction is None else correction.known
         self._ood = None if engine.header.ood is None else OodScore(engine.header.ood, own)
         self._views = engine.header.views if correction is None else None
@@ -128,6 +127,7 @@ class ForceEstimator:
         self._engine.reset()
         if self._ood is not None:
             self._ood.reset()
+        self._last: deque[Gray] = deque(maxlen=self._preprocess.reference_frames)
         self._attention: Floats | None = None
         self._view_score: float | None = None
         self._shape: tuple[int, ...] | None = None  # None: no frame so far
@@ -140,8 +140,10 @@ class ForceEstimator:
         Raises:
             DataError: The last frames are flat.
         """
+        last = self._last
         self.reset()
-        for small in self._last:
+        self._last = last
+        for small in last:
             self._steps(small)
 
     @property

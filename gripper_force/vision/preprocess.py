@@ -4,6 +4,7 @@ Subtracting a reference frame halves the error in simulation and lets the networ
 On images of real finger cameras, training on raw gray values failed.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Final, Self
 
 import cv2
@@ -87,6 +88,11 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
     return np.asarray(cv2.resize(gray, (size, size), interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def mean_image(frames: Sequence[Gray] | Gray) -> Gray:
+    """Returns the mean of images of one size, (S, S)."""
+    return np.asarray(np.mean(frames, axis=0).round(), np.uint8)
+
+
 class Normaliser:
     """Standardises the frames of a stream one by one and subtracts the stream's reference.
 
@@ -120,7 +126,7 @@ class Normaliser:
         waiting, self._waiting = self._waiting, []
         reference: npt.NDArray[np.float32] = np.mean([_standardise(image) for image in waiting], axis=0)
         self._reference = reference
-        self.reference_image = np.mean(waiting, axis=0).round().astype(np.uint8)
+        self.reference_image = mean_image(waiting)
         return [self._difference(image, reference) for image in waiting]
 
     def _difference(self, small: Gray, reference: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

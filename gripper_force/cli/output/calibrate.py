@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gripper_calibration.procedures.teach import Taught
     from gripper_force.jobs.object_gain import SavedGain
     from gripper_force.profiles.object_profile import Interval
-    from gripper_force.vision.header import OodModel
+    from gripper_force.vision.header import KnownViews, OodModel
 
 
 LOAD_CELL: Final = {
@@ -124,8 +124,8 @@ def _found(value: object) -> object:
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"
 
 
-def network_table(checkpoint: str, model: "OodModel") -> None:
-    """Prints the out-of-distribution score that a network has got."""
+def network_table(checkpoint: str, model: "OodModel", views: "KnownViews | None") -> None:
+    """Prints the out-of-distribution score and the limit of the known views that a network has got."""
     claimed = [model.std_base, math.hypot(model.std_base, model.std_growth)]
     pairs(
         {
@@ -133,6 +133,9 @@ def network_table(checkpoint: str, model: "OodModel") -> None:
             "limits of the score": ", ".join(
                 f"{one.limit:.2f} at {one.force_n:.1f} N" for one in model.limits
             ),
+            "limit of the known views": "as before: there are too few sets"
+            if views is None
+            else number(views.limit),
             "factor of the claimed error": f"{claimed[0]:.2f} for known frames, {claimed[1]:.2f} at the limit",
         }
     )

@@ -153,7 +153,7 @@ def calibrate_network(
     *,
     workers: int = 1,
     progress: Progress = no_progress,
-) -> OodModel:
+) -> tuple[OodModel, KnownViews | None]:
     """Fits a checkpoint's out-of-distribution score, known views and claimed deviation to logs, and writes it.
 
     Args:
@@ -163,6 +163,9 @@ def calibrate_network(
         source: Path or name of the checkpoint. Its weights stay.
         workers: Processes that read the logs.
         progress: Called twice for each log.
+
+    Returns:
+        The score's model, and the known views; None if the logs are of too few sets. The checkpoint then keeps its own.
 
     Raises:
         DataError: The logs that show contact are fewer than `MIN_LOGS`, or of fewer than `FOLDS` sets.
@@ -180,8 +183,9 @@ def calibrate_network(
             f"a score needs at least {MIN_LOGS} logs that show contact and were not trained on, of at least {FOLDS} "
             "sets; simulate or record more"
         )
-    add_ood(source, model, fit_views(clips, preprocess), out)
-    return model
+    views = fit_views(clips, preprocess)
+    add_ood(source, model, views, out)
+    return model, views
 
 
 def _limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:

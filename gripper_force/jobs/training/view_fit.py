@@ -7,10 +7,9 @@ from typing import Final
 import numpy as np
 
 from gripper_force.jobs.dataset import Clip
-from gripper_force.types import Gray
 from gripper_force.vision.header import KnownViews
 from gripper_force.vision.known_views import Floats, describe_view, distance2
-from gripper_force.vision.preprocess import Preprocess
+from gripper_force.vision.preprocess import Preprocess, mean_image
 
 MIN_VIEWS: Final = 33
 """Fewer views do not show a limit that few known ones exceed."""
@@ -38,7 +37,8 @@ def fit_views(clips: Sequence[Clip], preprocess: Preprocess) -> KnownViews | Non
     first = {(clip.object, clip.set): clip for clip in reversed(clips)}
     if not preprocess.reference or len(first) < MIN_VIEWS:
         return None
-    views = np.stack([describe_view(_reference(clip, preprocess)) for clip in first.values()])
+    references = [mean_image(clip.frames[: preprocess.reference_frames]) for clip in first.values()]
+    views = np.stack([describe_view(reference) for reference in references])
     fold = np.random.default_rng(0).permutation(len(views)) % _FOLDS
     distances = [distance2(views[fold == part], *_subspace(views[fold != part])) for part in range(_FOLDS)]
     mean, axes = _subspace(views)
@@ -47,12 +47,6 @@ def fit_views(clips: Sequence[Clip], preprocess: Preprocess) -> KnownViews | Non
         axes=urlsafe_b64encode(axes.astype(np.float16).tobytes()),
         limit=max(float(np.quantile(np.concatenate(distances), 1 - _REJECTED)), 1e-6),
     )
-
-
-def _reference(clip: Clip, preprocess: Preprocess) -> Gray:
-    """Returns the reference image of a recording, as `preprocess.Normaliser` does."""
-    mean = clip.frames[: preprocess.reference_frames].mean(0)
-    return np.asarray(mean.round(), np.uint8)
 
 
 def _subspace(views: Floats) -> tuple[Floats, Floats]:

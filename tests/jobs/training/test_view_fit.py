@@ -1,9 +1,12 @@
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from typer.testing import CliRunner
 
+from gripper_force import cli
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.ood_fit import calibrate_network
 from gripper_force.jobs.training.view_fit import MIN_VIEWS, fit_views
@@ -58,3 +61,18 @@ def test_calibrate_network_keeps_the_views_of_a_checkpoint_if_the_logs_show_few(
     calibrate_network(logs, out, "small")
     assert before is not None
     assert read_checkpoint(out)[2].views == before
+
+
+def test_the_command_tells_the_limit_or_that_the_views_stay(
+    press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
+) -> None:
+    for seed in range(MIN_VIEWS):
+        write_log(replace(press(seed), set=f"s{seed}"), tmp_path)
+    out = tmp_path / "out.safetensors"
+    call = ["calibrate", "network", str(tmp_path), "--checkpoint", "small", "--out", str(out), "--jobs", "1"]
+    done = CliRunner().invoke(cli.app, [*call, "--json"])
+    views = read_checkpoint(out)[2].views
+    assert views is not None
+    assert json.loads(done.stdout)["view_limit"] == views.limit
+    (tmp_path / next(tmp_path.glob("*.mcap")).name).unlink()
+    assert "as before: there are too few sets" in CliRunner().invoke(cli.app, call).stdout
