@@ -192,6 +192,8 @@ def drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) ->
     for event in sorted(events, key=lambda event: event.t_ns):
         if event.text.startswith(NO_ESTIMATE):
             problem_ns, problem = event.t_ns, event.text.removeprefix(NO_ESTIMATE)
+            if not bisect_right(ready_ns, problem_ns):  # vision was never in use, so it can't drop out
+                reasons.append((problem_ns, problem))
         elif (reason := drop_out_reason(event.text)) is not None:
             # The controller does not know why a frame gave no estimate; the session does.
             recovered = bisect_right(ready_ns, event.t_ns) > bisect_right(ready_ns, problem_ns)

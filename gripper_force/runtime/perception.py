@@ -40,11 +40,12 @@ class ProcessedFrame(NamedTuple):
 class FrameProcessor:
     """Runs the estimator on frames, and contains its errors.
 
-    An error before the first estimate means that the run is set up wrongly; it is raised. A later error only
-    costs the estimate of its frame: the controller continues on motor current. An unfamiliar frame keeps the
-    network's output, with an infinite claimed error; of a covered view it is NaN. A frame that equals the
-    previous one bit for bit gives no estimate, because sensors have noise and a camera that hangs has none. If
-    all frames up to the first estimate are equal, as in a recording without noise, repeats are accepted.
+    An error before the first estimate means that the run is set up wrongly; it is raised. A later error, or an object
+    or view that the network does not know, only costs the estimate of its frame: the controller continues on motor
+    current. An unfamiliar frame keeps the network's output, with an infinite claimed error; of a covered view it is
+    NaN. A frame that equals the previous one bit for bit gives no estimate, because sensors have noise and a camera
+    that hangs has none. If all frames up to the first estimate are equal, as in a recording without noise, repeats are
+    accepted.
     """
 
     def __init__(self, estimator: Estimator | None) -> None:
@@ -83,7 +84,8 @@ class FrameProcessor:
                 self._estimator.renew_reference()
             result = self._estimator.update(frame.gray)
         except Exception as error:
-            if not self._works:
+            is_seen = isinstance(error, UnfamiliarFrameError) and math.isfinite(error.force_n)
+            if not (self._works or is_seen):
                 raise
             problem = str(error) if isinstance(error, GripperError) else f"{type(error).__name__}: {error}"
             if not isinstance(error, UnfamiliarFrameError):

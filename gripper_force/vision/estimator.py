@@ -129,7 +129,7 @@ class ForceEstimator:
             self._ood.reset()
         self._last: deque[Gray] = deque(maxlen=self._preprocess.reference_frames)
         self._attention: Floats | None = None
-        self._view_score: float | None = None
+        self._knows_view: bool | None = None  # not compared so far
         self._shape: tuple[int, ...] | None = None  # None: no frame so far
 
     def renew_reference(self) -> None:
@@ -194,12 +194,12 @@ class ForceEstimator:
             raise NonFiniteError(f"the network returned {forces} N; check the checkpoint and the image")
         force_n = sum(forces) / len(forces)
         if self._views is not None and (reference := self.reference) is not None:
-            if self._view_score is None:
-                self._view_score = view_score(self._views, reference)
-            if self._view_score > 1:
+            if self._knows_view is None:
+                self._knows_view = view_score(self._views, reference) <= 1
+            if not self._knows_view:
                 raise UnfamiliarFrameError(
-                    f"the view before the contact is unlike those that the network knows ({self._view_score:.2f} times "
-                    "the limit): another object, view or background; calibrate the object, or train a network with it",
+                    "the view before the contact is unlike those that the network knows: another object, view or "
+                    "background; calibrate the object, or train a network with it",
                     force_n,
                 )
         features, score = step.features[None], 0.0  # (1, F)

@@ -144,6 +144,12 @@ def test_vision_that_was_never_used_is_a_loss_too():
     assert rounded(used) == (0.0, [("no estimate was used", 1.0)])
 
 
+def test_a_view_that_the_network_does_not_know_is_the_reason_of_a_loss():
+    states = statuses(Phase.HOLD, Phase.RELEASE)
+    used = vision_in_hold(states, fused(states, lambda _: False), [], told((0, "no estimate: unlike all")))
+    assert rounded(used) == (0.0, [("unlike all", 1.0)])
+
+
 def test_a_loss_says_that_a_number_in_its_reason_is_that_of_its_first_estimate():
     assert str(VisionLoss("it jumps by -0.90 N", 0.25)) == "for 0.2 s: at first it jumps by -0.90 N"
     assert str(VisionLoss("no new estimate", 1.0)) == "for 1.0 s: no new estimate"

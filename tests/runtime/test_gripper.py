@@ -272,6 +272,20 @@ def test_a_new_object_begins_without_the_gain_of_the_one_before(
     assert gripper.grasp(3.0, new_object=True).vision_share == 0
 
 
+def test_an_object_that_the_network_does_not_know_is_held_by_motor_current(
+    quick: list[str], tmp_path: Path
+) -> None:
+    seeing = ["object=peg", "camera.backend=simulated", "vision.checkpoint=small", "control.feedback=fused"]
+    log = tmp_path / "peg.mcap"
+    with gf.open_gripper(overrides=[*quick, *seeing], log=log) as gripper:
+        result = gripper.grasp(3.0)
+    assert result.vision_share == 0
+    assert result.force_n == pytest.approx(3.0, abs=0.2)
+    events = [event.text for event in LogReader(log).records(gf.Event)]
+    assert any("view before the contact is unlike" in text for text in events)
+    assert replay(log).identical
+
+
 @pytest.mark.parametrize("new_object", [False, True])
 def test_vision_takes_a_new_reference_with_a_new_object(
     quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new_object: bool

@@ -179,6 +179,23 @@ def test_the_force_in_an_unfamiliar_frame_claims_nothing() -> None:
     assert [s.problem for s in seen] == ["", "", "unlike all"]
 
 
+def test_a_view_that_the_network_does_not_know_is_no_error_and_a_covered_one_is() -> None:
+    for force_n in (3.0, np.nan):
+        camera = Shutter()
+        perception = LockstepPerception(
+            camera, FakeEstimator(UnfamiliarFrameError("unlike all", force_n)), Hand(), 0.0
+        )
+        camera.give(0)
+        if np.isnan(force_n):
+            with pytest.raises(UnfamiliarFrameError):
+                perception.poll()
+            continue
+        (seen,) = perception.poll()
+        assert seen.problem == "unlike all"
+        assert seen.visual is not None
+        assert not seen.visual.is_familiar
+
+
 def test_a_camera_that_hangs_gives_no_estimates() -> None:
     camera, estimator = Shutter(), FakeEstimator()
     perception = LockstepPerception(camera, estimator, Hand(), 0.0)
