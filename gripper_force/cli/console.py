@@ -263,7 +263,7 @@ def number(value: object, unit: str = "", digits: int = 3) -> str:
     """Formats a figure with its unit; a dash for a missing value."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
-    return f"{value:.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
+    return f"{value:z.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
 
 
 def words(key: str) -> str:

@@ -3,11 +3,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from gripper_force.config import config_from
 from gripper_force.errors import DataError
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import GraspSummary
+from gripper_force.jobs.report import plots
 from gripper_force.jobs.report.plots import draw_estimates, draw_grasps, draw_training
 from gripper_force.jobs.trials import summarise_trials, write_figure
 
@@ -90,6 +92,19 @@ def test_training_is_drawn_also_with_few_steps(tmp_path: Path) -> None:
     losses = {"ssam": np.array([[0.0, 3.0], [10.0, 2.0]]), "scam": np.zeros((0, 2))}
     draw_training(losses, force_n, force_n, np.full(50, "egg"), 2.5, "a title", tmp_path / "training.png")
     assert colours(tmp_path / "training.png") > 100
+
+
+def test_a_training_of_one_point_is_a_dot(tmp_path: Path) -> None:
+    force_n, path = np.linspace(0, 8, 50), tmp_path / "training.png"
+    draw_training(
+        {"ssam": np.array([[0.0, 3.0]])}, force_n, force_n, np.full(50, "egg"), 2.5, "a title", path
+    )
+    image = cv2.imread(str(path))
+    assert image is not None
+    left = image[:, : image.shape[1] // 2, ::-1].astype(int)
+    colour = np.rint(255 * np.array(to_rgb(plots._COLOURS[0])))
+    drawn = np.count_nonzero(np.abs(left - colour).max(2) < 8)
+    assert drawn > 200, "more than the line in the legend"
 
 
 def test_a_figure_of_an_unknown_kind_is_refused_before_the_work(tmp_path: Path) -> None:

@@ -163,7 +163,8 @@ def draw_training(
     with saved_figure(path, title, 4.6) as figure:
         loss, estimates = figure.subplots(1, 2)
         for (name, values), colour in zip(losses.items(), _COLOURS, strict=False):
-            loss.plot(values[:, 0], values[:, 1], color=colour, lw=1.0, label=name)
+            marker = "o" if len(values) == 1 else None  # a line of one point would not show
+            loss.plot(values[:, 0], values[:, 1], color=colour, lw=1.0, marker=marker, label=name)
         loss.axhline(constant_rmse_n, color=_GRAY, lw=1.0, ls="--", label="constant: the mean force")
         loss.set_ylim(0)
         label_axes(loss, "Training error", "steps", "RMSE of the clips of a step, smoothed, N")
