@@ -119,6 +119,12 @@ def test_a_region_is_compared_with_the_frames_of_the_camera(quick_vision: list[s
     assert all(check.ok is not False for check in doctor.check_unit(within, "camera"))
 
 
+def test_a_network_that_knows_its_views_is_timed_with_an_image_that_it_does_not_know() -> None:
+    config = load_config(None, ["camera.backend=simulated", "vision.checkpoint=small", "clock=lockstep"])
+    *_, step = doctor._network(config)
+    assert step.found.endswith("of 50")
+
+
 @pytest.mark.parametrize(("median_ms", "good"), [(12.0, True), (70.0, False)])
 def test_a_network_that_is_slower_than_the_camera_has_alternatives(
     median_ms: float, good: bool, quick_vision: list[str], monkeypatch: pytest.MonkeyPatch
