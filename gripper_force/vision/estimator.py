@@ -131,6 +131,7 @@ class ForceEstimator:
         self._attention: Floats | None = None
         self._knows_view: bool | None = None  # not compared so far
         self._shape: tuple[int, ...] | None = None  # None: no frame so far
+        self._has_no_reference = False
 
     def renew_reference(self) -> None:
         """Starts a new stream whose reference is the last frames: of another object, or from a camera that was moved.
@@ -138,13 +139,15 @@ class ForceEstimator:
         They must show no contact.
 
         Raises:
-            DataError: The last frames are flat.
+            DataError: The last frames are flat, or unlike each other. Then no frame gives an estimate until the
+                reference is renewed again: the next ones may show contact.
         """
-        last = self._last
+        last, shape = self._last, self._shape
         self.reset()
-        self._last = last
+        self._last, self._shape, self._has_no_reference = last, shape, True
         for small in last:
             self._steps(small)
+        self._has_no_reference = False
 
     @property
     def reference(self) -> Gray | None:
@@ -175,6 +178,10 @@ class ForceEstimator:
             remedy = "keep the camera's resolution, or start a new stream"
             raise DataError(f"the frame is {gray.shape}, but the stream began with {self._shape}; {remedy}")
         self._last.append(small)
+        if self._has_no_reference:
+            raise DataError(
+                "there is no reference: the view was flat or moved before it; renew it once the view is still"
+            )
         steps = self._steps(small)
         self._shape = gray.shape
         return self._estimate(steps[-1]) if steps else None

@@ -301,6 +301,30 @@ def test_a_renewed_reference_is_that_of_the_last_frames(frames: np.ndarray) -> N
     assert run(renewed, moved[10:]) == run(fresh, moved[10:])
 
 
+def test_frames_that_are_no_reference_end_the_estimates_until_later_ones_are(frames: np.ndarray) -> None:
+    """Otherwise the next frames became the reference, and they may show contact."""
+    renewed, fresh = (ForceEstimator(engine(ensemble("ssam")), REGION) for _ in range(2))
+    run(renewed, frames[:10])
+    with pytest.raises(DataError, match="flat"):
+        renewed.update(np.full_like(frames[0], 30))
+    with pytest.raises(DataError, match="flat"):
+        renewed.renew_reference()
+    for frame in frames[10:18]:
+        with pytest.raises(DataError, match="there is no reference"):
+            renewed.update(frame)
+    renewed.renew_reference()
+    run(fresh, frames[14:18])
+    assert run(renewed, frames[18:]) == run(fresh, frames[18:])
+
+
+def test_a_renewed_reference_keeps_the_size_of_the_frames(frames: np.ndarray) -> None:
+    estimator = ForceEstimator(engine(ensemble("ssam")), REGION)
+    run(estimator, frames[:10])
+    estimator.renew_reference()
+    with pytest.raises(DataError, match="the stream began with"):
+        estimator.update(np.pad(frames[10], 8))
+
+
 def test_a_reference_that_is_renewed_at_once_takes_the_next_frames(frames: np.ndarray) -> None:
     estimator, fresh = (ForceEstimator(engine(ensemble("ssam")), REGION) for _ in range(2))
     run(estimator, frames[:2])
