@@ -129,7 +129,8 @@ def _network(config: Config) -> Iterator[Check]:
     # The region is one of the camera's frames, which can be larger than those that this check makes.
     whole = config.with_values(vision={"region": None})
     estimator = make_estimator(ResolvedConfig(whole, model))
-    assert estimator is not None  # the configuration has vision
+    assert model is not None  # the configuration has vision
+    assert estimator is not None
     vision = config.vision
     package = f"{vision.engine} {engine_version(vision.engine)}".strip()
     threads = f"{vision.precision}, {vision.threads} of {os.cpu_count()} threads"

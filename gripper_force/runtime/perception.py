@@ -110,12 +110,16 @@ def _attention(frame: Frame, ready_ns: int, estimator: Estimator) -> AttentionMa
 
 
 class LockstepPerception:
-    """Processes frames in the caller's thread; estimates are ready after a fixed simulated time."""
+    """Processes frames in the caller's thread; estimates are ready after a fixed simulated time.
+
+    Attributes:
+        processor: Makes the estimates.
+    """
 
     def __init__(
         self, camera: Camera | None, estimator: Estimator | None, clock: Clock, compute_ms: float
     ) -> None:
-        self._camera, self._processor, self._clock = camera, FrameProcessor(estimator), clock
+        self._camera, self.processor, self._clock = camera, FrameProcessor(estimator), clock
         self._compute_ns = round(compute_ms * NS_PER_MS) if estimator is not None else 0
         self._under_way: deque[tuple[int, ProcessedFrame]] = deque()
 
@@ -128,28 +132,28 @@ class LockstepPerception:
         busy = self._under_way and self._under_way[-1][0] > now_ns
         if not busy and self._camera is not None and (frame := self._camera.newest()) is not None:
             ready_ns = now_ns + self._compute_ns
-            self._under_way.append((ready_ns, self._processor.process(frame, lambda: ready_ns)))
+            self._under_way.append((ready_ns, self.processor.process(frame, lambda: ready_ns)))
         ready = []
         while self._under_way and self._under_way[0][0] <= now_ns:
             ready.append(self._under_way.popleft()[1])
         return ready
-
-    def renew_reference(self, t_ns: int) -> None:
-        """Renews the reference, see `FrameProcessor.renew_reference`."""
-        self._processor.renew_reference(t_ns)
 
     def close(self) -> None:
         """Has no effect: there is no thread."""
 
 
 class ThreadedPerception:
-    """Processes the newest frame in a background thread."""
+    """Processes the newest frame in a background thread.
+
+    Attributes:
+        processor: Makes the estimates.
+    """
 
     _IDLE_S = 0.001
     _PATIENCE_S = 1.0
 
     def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
-        self._camera, self._processor, self._clock = camera, FrameProcessor(estimator), clock
+        self._camera, self.processor, self._clock = camera, FrameProcessor(estimator), clock
         self._done: deque[ProcessedFrame] = deque()
         self._failure: Exception | None = None
         self._stop = threading.Event()
@@ -166,10 +170,6 @@ class ThreadedPerception:
             raise self._failure
         return [self._done.popleft() for _ in range(len(self._done))]
 
-    def renew_reference(self, t_ns: int) -> None:
-        """Renews the reference, see `FrameProcessor.renew_reference`."""
-        self._processor.renew_reference(t_ns)
-
     def close(self) -> None:
         """Stops the thread; gives up after 1 s if the estimator hangs. May be called twice."""
         self._stop.set()
@@ -184,7 +184,7 @@ class ThreadedPerception:
                 if frame is None:
                     self._stop.wait(self._IDLE_S)
                     continue
-                self._done.append(self._processor.process(frame, self._clock.now_ns))
+                self._done.append(self.processor.process(frame, self._clock.now_ns))
         except Exception as error:  # re-raised in the control thread
             self._failure = error
 

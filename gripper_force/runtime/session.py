@@ -226,6 +226,9 @@ class Session:
         if self._stop_requested:
             self._stop_requested, request = False, Request(state.t_ns, RequestKind.STOP)
         decision = self._controller.step(state.t_ns, state, visual, request)
+        # At once: the log has a frame that is processed in the meantime after this cycle, as a replay renews it.
+        if request is not None and request.new_object and not decision.refusal:
+            self._perception.processor.renew_reference(state.t_ns)
         devices.servo.write(decision.command)
         self.cycles += 1
         self.failed = decision.status.phase == Phase.FAULT
@@ -235,8 +238,6 @@ class Session:
         for record in (*inputs, decision.estimate, decision.command, decision.status, *decision.events):
             self._log(record)
         self._log_sensors(state.t_ns)
-        if request is not None and request.new_object and not decision.refusal:
-            self._perception.renew_reference(state.t_ns)
         return decision
 
     def _poll_perception(self) -> VisualForce | None:

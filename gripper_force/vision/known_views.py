@@ -15,21 +15,19 @@ import numpy.typing as npt
 from gripper_force.types import Gray
 from gripper_force.vision.header import VIEW_LENGTH, KnownViews
 
-_SIDE: Final = 64
-_BLOCK: Final = 32
-_STEP: Final = 16
-_CELL: Final = 16
+_SIDES: Final = (64, 32, 16, 16)
 _DIRECTIONS: Final = 18
-"""Blocks of four cells overlap by half, and each is normalised: 9 blocks of 4 cells of 18 directions."""
+"""Sides of the image, its blocks, their steps and their cells, in pixels. Blocks of four cells overlap by half, and
+each is normalised: 9 blocks of 4 cells of 18 directions."""
 
 Floats = npt.NDArray[np.float64]
 
 
 def describe_view(reference: Gray) -> Floats:
     """Returns the description of a reference image (S, S), (`VIEW_LENGTH`,)."""
-    window, block, step, cell = [(side, side) for side in (_SIDE, _BLOCK, _STEP, _CELL)]
+    window, block, step, cell = [(side, side) for side in _SIDES]
     hog = cv2.HOGDescriptor(window, block, step, cell, _DIRECTIONS, _signedGradient=True)
-    image = cv2.resize(reference, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
+    image = cv2.resize(reference, window, interpolation=cv2.INTER_AREA)
     return np.asarray(hog.compute(image), np.float64).reshape(VIEW_LENGTH)
 
 
