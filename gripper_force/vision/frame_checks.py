@@ -40,11 +40,23 @@ _SAMPLED_SIDE: Final = 32
 _FIT_SCALES: Final = np.geomspace(12, 3, 6, dtype=np.float32)
 """Scale of the robust fit in gray levels, at each of its steps."""
 
+_STILL_LEVELS: Final = 2 * float(_FIT_SCALES[-1])
+"""Gray levels by which a pixel that follows a change may differ from it."""
+
 _MIN_PX: Final = 64
 """Side of the smallest image in which disturbances are looked for: the limits are half a pixel there."""
 
 _MIN_STILL: Final = 0.25
 """Smallest share of the image that must follow the fitted change. In presses it is 0.5 or more."""
+
+_LARGE_SHIFT: Final = 0.3
+"""Largest shift that is looked for by correlation, as a share of the image's side. The fit finds the smallest."""
+
+_FEW_STILL: Final = 0.6
+"""Share of the image that follows the fitted change, below which a larger shift is looked for."""
+
+_EXPLAINED: Final = 0.05
+"""Part of the image by which a large shift must explain more of it than none does. In presses it explains less."""
 
 _SMOOTHING_PX: Final = 0.8
 """Standard deviation of the smoothing against noise, in pixels."""
@@ -63,7 +75,7 @@ class FrameChecks:
     jaws and object move, but the rest of the image stays. So a change of the whole image, its shift, zoom and
     change of light, is fitted robustly: what does not follow it gets no weight (M-estimator of Geman and McClure on
     one step of Lucas and Kanade, IJCAI 1981; M. J. Black and P. Anandan, Computer Vision and Image Understanding 63
-    (1996) 75-104, doi:10.1006/cviu.1996.0006).
+    (1996) 75-104, doi:10.1006/cviu.1996.0006). A shift beyond the range of that fit is found by phase correlation.
     """
 
     def __init__(self, max_covered: float = MAX_COVERED) -> None:
@@ -121,10 +133,12 @@ class FrameChecks:
             weight = 1 / np.square(1 + np.square((difference - change @ directions) / scale))
             sums = np.multiply(directions, weight, out=self._weighted) @ self._fitted.T  # (7, 8)
             change = cv2.solve(sums[:, :-1] + self._prior, sums[:, -1:], flags=cv2.DECOMP_CHOLESKY)[1][:, 0]
-        still = np.abs(difference - change @ directions) < 2 * _FIT_SCALES[-1]
+        still = np.abs(difference - change @ directions) < _STILL_LEVELS
         if still.mean() < _MIN_STILL:  # nothing to compare with
             change[:], still[:] = 0, False
         shift, zoom = float(np.hypot(*change[:2])), float(abs(change[2]))
+        if still.mean() < _FEW_STILL:
+            shift = max(shift, self._large_shift(smooth))
         slope = float(np.hypot(*change[5:])) / self._first[0] if self._first else 0.0
         detail = _block_means(np.square(cv2.Laplacian(smooth, cv2.CV_32F)))
         ratio = (detail + _DETAIL_NOISE) / (self._detail + _DETAIL_NOISE)
@@ -141,11 +155,30 @@ class FrameChecks:
             "covered": (covered, self._max_covered, hidden),
         }
 
+    def _large_shift(self, smooth: Floats) -> float:
+        """Returns the shift since the first frame as a share of the side, if it explains the image better than none."""
+        side = len(smooth)
+        (right, down), _ = cv2.phaseCorrelate(
+            self._smooth - self._smooth.mean(), smooth - smooth.mean(), self._window
+        )
+        if not MAX_SHIFT < max(abs(right), abs(down)) / side < _LARGE_SHIFT:
+            return 0.0
+        move = np.array([[1, 0, right], [0, 1, down]], np.float32)
+        moved = cv2.warpAffine(self._smooth, move, (side, side), borderMode=cv2.BORDER_REPLICATE)
+        explained = self._explained(smooth - moved) - self._explained(smooth - self._smooth)
+        return float(np.hypot(right, down)) / side if explained > _EXPLAINED else 0.0
+
+    def _explained(self, difference: Floats) -> float:
+        """Returns the share of the pixels that differ by the same, but for noise."""
+        sampled = difference.take(self._sampled)
+        return float((np.abs(sampled - np.median(sampled)) < _STILL_LEVELS).mean())
+
     def _set_first_frame(self, pixels: Floats) -> None:
         """Prepares the comparison with the first frame."""
         self._smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING_PX)
         self._detail = _block_means(np.square(cv2.Laplacian(self._smooth, cv2.CV_32F)))
         side = len(pixels)
+        self._window = cv2.createHanningWindow((side, side), cv2.CV_32F)
         along = ((np.arange(_SAMPLED_SIDE) + 0.5) * side / _SAMPLED_SIDE).astype(int)
         self._sampled = (along[:, None] * side + along).ravel()  # (N,), indices of evenly spaced pixels
         y, x = np.meshgrid(*[np.linspace(-1, 1, side, dtype=np.float32)] * 2, indexing="ij")

@@ -81,6 +81,7 @@ def press(tmp_path_factory: pytest.TempPathFactory) -> Gray:
     ("change", "remark"),
     [
         (recognition.shift, "view moved"),
+        (recognition.bump, "view moved"),
         (recognition.zoom, "zoomed"),
         (recognition.refocus, "fine detail"),
         (recognition.lamp, "the light changed"),
