@@ -46,6 +46,10 @@ class FrameProcessor:
     NaN. A frame that equals the previous one bit for bit gives no estimate, because sensors have noise and a camera
     that hangs has none. If all frames up to the first estimate are equal, as in a recording without noise, repeats are
     accepted.
+
+    Attributes:
+        renewal_ns: Time to set if the last frames up to it are to become the reference of those after it. They must
+            show no contact.
     """
 
     def __init__(self, estimator: Estimator | None) -> None:
@@ -53,11 +57,7 @@ class FrameProcessor:
         self._works = False
         self._last: Gray | None = None
         self._may_repeat: bool | None = None  # unknown
-        self._renewal_ns: int | None = None
-
-    def renew_reference(self, t_ns: int) -> None:
-        """Makes the last frames up to a time the reference of those after it. They must show no contact."""
-        self._renewal_ns = t_ns
+        self.renewal_ns: int | None = None
 
     def process(self, frame: Frame, now_ns: Callable[[], int] | None = None) -> ProcessedFrame:
         """Estimates the force in a frame.
@@ -79,8 +79,8 @@ class FrameProcessor:
             return ProcessedFrame(frame, None, "the camera repeats its last image; check whether it hangs")
         begin_ns, problem = time.perf_counter_ns(), ""
         try:
-            if self._renewal_ns is not None and frame.t_ns > self._renewal_ns:
-                self._renewal_ns = None
+            if self.renewal_ns is not None and frame.t_ns > self.renewal_ns:
+                self.renewal_ns = None
                 self._estimator.renew_reference()
             result = self._estimator.update(frame.gray)
         except Exception as error:

@@ -34,7 +34,7 @@ _MIN_TRAVEL_RAD = 0.3
 """Smallest plausible rotation of the horn for the whole travel of a rack. With less, the pinion's radius is wrong."""
 
 _NO_SCORE = (
-    "the network has no out-of-distribution score, so unfamiliar objects are not noticed; bfloat16, int8 and Gaussian "
+    "the network has no out-of-distribution score, so unfamiliar frames are not noticed; bfloat16, int8 and Gaussian "
     "processes have none, and `gripper-force calibrate network` fits that of other networks"
 )
 

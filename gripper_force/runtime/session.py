@@ -228,7 +228,7 @@ class Session:
         decision = self._controller.step(state.t_ns, state, visual, request)
         # At once: the log has a frame that is processed in the meantime after this cycle, as a replay renews it.
         if request is not None and request.new_object and not decision.refusal:
-            self._perception.processor.renew_reference(state.t_ns)
+            self._perception.processor.renewal_ns = state.t_ns
         devices.servo.write(decision.command)
         self.cycles += 1
         self.failed = decision.status.phase == Phase.FAULT

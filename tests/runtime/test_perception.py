@@ -75,7 +75,7 @@ def test_a_reference_is_renewed_before_the_first_frame_after_the_request() -> No
     forces_n = []
     for seq in range(6):
         if seq == 3:  # frame 3 was captured at 60 ms, before the request
-            perception.processor.renew_reference(65 * NS_PER_MS)
+            perception.processor.renewal_ns = 65 * NS_PER_MS
         camera.give(seq, 20 * seq)
         clock.now_ms = 20 * seq + 10
         (seen,) = perception.poll()

@@ -198,7 +198,7 @@ class _Feed:
         request = self._request
         decision = controller.step(state.t_ns, state, self._newest, request)
         if request is not None and request.new_object and not decision.refusal:
-            self._processor.renew_reference(state.t_ns)
+            self._processor.renewal_ns = state.t_ns
         self._newest = self._request = None
         self._sink.add_decision(decision)
         self._commands.add_replayed(decision.command)
