@@ -180,7 +180,7 @@ class ForceEstimator:
         self._last.append(small)
         if self._has_no_reference:
             raise DataError(
-                "there is no reference: the view was flat or moved before it; renew it once the view is still"
+                "there is no reference: the view was flat or moved at the renewal; renew it with a still view"
             )
         steps = self._steps(small)
         self._shape = gray.shape
