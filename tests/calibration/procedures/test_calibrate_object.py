@@ -1,6 +1,7 @@
 """Object profiles from touches on the simulated rig, and grasps with them."""
 
 import json
+import math
 import shutil
 import signal
 import subprocess
@@ -29,7 +30,7 @@ from gripper_force import __version__
 from gripper_force.cli import app, console
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.control.transmission import Transmission
-from gripper_force.errors import ConfigError, DataError, RequestError
+from gripper_force.errors import ConfigError, DataError, RequestError, UnfamiliarFrameError
 from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.grasp import grasp
 from gripper_force.jobs.replay import replay
@@ -275,14 +276,14 @@ def test_profile_with_missing_or_wrong_weights_is_refused(profile: Path, tmp_pat
 
 
 def rejected_share(log: Path, profile: Path | None) -> float:
-    """Share of a log's frames whose out-of-distribution score is over the limit."""
+    """Share of a log's frames that show what the network, or the profile, does not know."""
     estimator, rejected, count = ForceEstimator.load("default", profile=profile, threads=1), 0, 0
     for frame in LogReader(log).records(Frame):
         count += 1
         try:
             estimator.update(frame.gray)
-        except DataError as error:
-            rejected += "out-of-distribution score" in str(error)
+        except UnfamiliarFrameError as error:
+            rejected += math.isfinite(error.force_n)
     return rejected / count
 
 
