@@ -221,9 +221,10 @@ def summarise_grasp(path: Path) -> GraspSummary:
         records[type(record)].append(record)
     statuses, cells = records[GraspStatus], sorted(records[LoadCellSample], key=lambda c: c.t_ns)
     cycles_ns = [state.t_ns for state in records[ServoState]]
-    visuals = [visual for visual in records[VisualForce] if visual.is_familiar]
-    compute_ms = [visual.compute_ms for visual in visuals]
-    vision_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
+    seen = [visual for visual in records[VisualForce] if math.isfinite(visual.force_n)]  # by the network
+    compute_ms = [visual.compute_ms for visual in seen]
+    vision_s = (seen[-1].t_ns - seen[0].t_ns) / NS_PER_S if len(seen) > 1 else 0.0
+    visuals = [visual for visual in seen if visual.is_familiar]
     config = config_from_text(reader.config, str(path))
     vision = vision_in_hold(statuses, records[FusedForce], visuals, records[Event])
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
@@ -256,7 +257,7 @@ def summarise_grasp(path: Path) -> GraspSummary:
         "estimator_p50_ms": percentile(compute_ms, 50),
         "estimator_p99_ms": percentile(compute_ms, 99),
         "loop_hz": (len(cycles_ns) - 1) / span_s if span_s else None,
-        "camera_hz": (visuals[-1].seq - visuals[0].seq) / vision_s if vision_s else None,
+        "camera_hz": (seen[-1].seq - seen[0].seq) / vision_s if vision_s else None,
         "samples_rejected": sum(not cell.valid for cell in cells) if cells else None,
         "estimate_mae_n": {
             "visual": _mae_n([(v.t_ns, v.force_n) for v in visuals], cells),

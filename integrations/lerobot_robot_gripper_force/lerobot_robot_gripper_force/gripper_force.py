@@ -185,7 +185,9 @@ class GripperForce(Robot):
             elif sent == 0.0:
                 gripper.move(open_width_m, wait=False)
             else:
-                gripper.grasp(sent, wait=False)
+                # An arm has moved the camera since the jaws opened, and the object may be another.
+                is_open = state.phase == gf.Phase.OPEN or state.outcome == gf.Outcome.MOVED
+                gripper.grasp(sent, wait=False, new_object=is_open)
             self._sent = sent
         return {key: sent}
 

@@ -135,6 +135,18 @@ def test_an_equal_action_makes_no_new_request(make_robot: Make, tmp_path: Path) 
     assert requests == [("grasp", 3.0), ("grasp", 2.0), ("move", 0.0)]
 
 
+def test_a_grasp_from_open_jaws_is_of_a_new_object(make_robot: Make, tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    robot = make_robot("camera.backend=none", log=log)
+    robot.connect()
+    for force_n, count in ((3.0, 20), (2.0, 5), (0.0, 60), (3.0, 20), (0.0, 2), (3.0, 2)):
+        run(robot, count, force_n=force_n)
+    robot.disconnect()
+    requests = [(r.kind, r.new_object) for r in gf.LogReader(log).records(gf.Request)]
+    held, opened = ("grasp", False), ("move", False)
+    assert requests == [("grasp", True), held, opened, ("grasp", True), opened, held]
+
+
 @pytest.mark.parametrize("action", [3.0, 2.0, 0.0])
 def test_no_action_resets_a_stop(make_robot: Make, action: float) -> None:
     robot = make_robot("camera.backend=none")
