@@ -205,8 +205,8 @@ class ForceEstimator:
                 self._knows_view = view_score(self._views, reference) <= 1
             if not self._knows_view:
                 raise UnfamiliarFrameError(
-                    "the view before the contact is unlike those that the network knows: another object, view or "
-                    "background; calibrate the object, or train a network with it",
+                    "the network does not know the view before the contact (object, camera, background); "
+                    "calibrate the object",
                     force_n,
                 )
         features, score = step.features[None], 0.0  # (1, F)

@@ -282,7 +282,7 @@ def test_an_object_that_the_network_does_not_know_is_held_by_motor_current(
     assert result.vision_share == 0
     assert result.force_n == pytest.approx(3.0, abs=0.2)
     events = [event.text for event in LogReader(log).records(gf.Event)]
-    assert any("view before the contact is unlike" in text for text in events)
+    assert any("does not know the view before" in text for text in events)
     assert replay(log).identical
 
 

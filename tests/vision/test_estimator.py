@@ -279,7 +279,7 @@ def test_a_view_that_the_network_does_not_know_gives_no_estimate(frames: np.ndar
     unknown = ForceEstimator(engine(other), REGION)
     assert run(unknown, frames[:3]) == [None] * 3
     for frame, estimate in zip(frames[3:], expected[3:], strict=True):
-        with pytest.raises(UnfamiliarFrameError, match="before the contact is unlike those") as caught:
+        with pytest.raises(UnfamiliarFrameError, match="does not know the view before") as caught:
             unknown.update(frame)
         assert estimate is not None
         assert caught.value.force_n == estimate.force_n
