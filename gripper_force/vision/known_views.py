@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from gripper_force.types import Gray
 from gripper_force.vision.header import VIEW_LENGTH, KnownViews
+from gripper_force.vision.ood import distance2
 
 _SIDES: Final = (64, 32, 16, 16)
 _DIRECTIONS: Final = 18
@@ -31,21 +32,8 @@ def describe_view(reference: Gray) -> Floats:
     return np.asarray(hog.compute(image), np.float64).reshape(VIEW_LENGTH)
 
 
-def distance2(descriptions: Floats, mean: npt.NDArray[np.floating], axes: npt.NDArray[np.floating]) -> Floats:
-    """Returns the squared distances from a subspace, (N,).
-
-    Args:
-        descriptions: Descriptions of views, (N, `VIEW_LENGTH`).
-        mean: Mean of the known ones, (`VIEW_LENGTH`,).
-        axes: Orthonormal basis of their subspace, (`VIEW_LENGTH`, R).
-    """
-    deviation = descriptions - mean
-    found: Floats = np.square(deviation - (deviation @ axes) @ axes.T).sum(1)
-    return found
-
-
 def view_score(known: KnownViews, reference: Gray) -> float:
     """Returns the squared distance of a reference image (S, S) from the known views, over its limit."""
     mean = np.frombuffer(known.mean, np.float32)
     axes = np.frombuffer(known.axes, np.float16).reshape(VIEW_LENGTH, -1).astype(np.float64)
-    return float(distance2(describe_view(reference)[None], mean, axes)[0]) / known.limit
+    return float(distance2(describe_view(reference)[None] - mean, axes)[0]) / known.limit

@@ -23,6 +23,13 @@ FRAMES: Final = 20
 """Frames that the score is averaged over: a third of a second at 60 frames per second."""
 
 
+def distance2(deviation: Floats, axes: npt.NDArray[np.floating]) -> Floats:
+    """Returns the squared distances from a subspace, (N,), of deviations (N, F) from its mean, for its basis (F, R)."""
+    # The difference of the two squares would cancel: a known frame is within a thousandth of the subspace.
+    found: Floats = np.square(deviation - (deviation @ axes) @ axes.T).sum(1)
+    return found
+
+
 def residual_share(
     features: npt.NDArray[np.floating],
     mean: npt.NDArray[np.floating],
@@ -38,9 +45,7 @@ def residual_share(
         floor: Added to the squared distance from the mean: there is always noise.
     """
     deviation = features.astype(np.float64) - mean
-    # The difference of the two squares would cancel: a known frame is within a thousandth of the subspace.
-    residual = np.square(deviation - (deviation @ axes) @ axes.T).sum(1)
-    share: Floats = residual / (np.square(deviation).sum(1) + floor)
+    share: Floats = distance2(deviation, axes) / (np.square(deviation).sum(1) + floor)
     return share
 
 

@@ -8,7 +8,7 @@ from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.runtime.resolve import resolve
 from gripper_force.types import Gray
 from gripper_force.vision.header import VIEW_LENGTH
-from gripper_force.vision.known_views import describe_view, distance2, view_score
+from gripper_force.vision.known_views import describe_view, view_score
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.preprocess import downscale
 from gripper_hw.sim.kinds import held_out_kinds
@@ -54,16 +54,6 @@ def test_a_description_depends_on_shape_more_than_on_light_and_noise(gain: float
     )
     assert first.shape == (VIEW_LENGTH,)
     assert np.linalg.norm(first - same) < 0.7 * np.linalg.norm(first - other)
-
-
-def test_the_distance_is_that_from_the_subspace() -> None:
-    rng = np.random.default_rng(0)
-    axes = np.linalg.qr(rng.normal(size=(VIEW_LENGTH, 3)))[0]
-    mean, beyond = rng.normal(size=VIEW_LENGTH), rng.normal(size=VIEW_LENGTH)
-    beyond -= axes @ (axes.T @ beyond)
-    inside = mean + axes @ np.array([3.0, -2.0, 1.0])
-    found = distance2(np.stack([inside, inside + beyond]), mean, axes)
-    assert found.tolist() == pytest.approx([0, beyond @ beyond], abs=1e-9)
 
 
 def test_an_image_without_detail_has_a_description() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 
 from gripper_force.jobs.dataset import Clip
 from gripper_force.vision.header import KnownViews
-from gripper_force.vision.known_views import Floats, describe_view, distance2
+from gripper_force.vision.known_views import Floats, describe_view
+from gripper_force.vision.ood import distance2
 from gripper_force.vision.preprocess import Preprocess, mean_image
 
 MIN_VIEWS: Final = 33
@@ -40,7 +41,10 @@ def fit_views(clips: Sequence[Clip], preprocess: Preprocess) -> KnownViews | Non
     references = [mean_image(clip.frames[: preprocess.reference_frames]) for clip in first.values()]
     views = np.stack([describe_view(reference) for reference in references])
     fold = np.random.default_rng(0).permutation(len(views)) % _FOLDS
-    distances = [distance2(views[fold == part], *_subspace(views[fold != part])) for part in range(_FOLDS)]
+    distances = []
+    for part in range(_FOLDS):
+        mean, axes = _subspace(views[fold != part])
+        distances.append(distance2(views[fold == part] - mean, axes))
     mean, axes = _subspace(views)
     return KnownViews(
         mean=urlsafe_b64encode(mean.astype(np.float32).tobytes()),
