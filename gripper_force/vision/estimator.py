@@ -180,7 +180,8 @@ class ForceEstimator:
         self._last.append(small)
         if self._has_no_reference:
             raise DataError(
-                "there is no reference: the view was flat or moved at the renewal; renew it with a still view"
+                "there is no reference: the view was flat or moved when it was renewed; renew it before a still view "
+                "(grasp with new_object=True)"
             )
         steps = self._steps(small)
         self._shape = gray.shape
