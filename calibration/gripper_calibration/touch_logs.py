@@ -13,7 +13,7 @@ from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
-from gripper_force.jobs.dataset import CONTACT_N, read_clip, starts_in_contact
+from gripper_force.jobs.dataset import CLIP_RECORDS, CONTACT_N, Clip, read_clip, starts_in_contact
 from gripper_force.jobs.metrics import lag_s
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
@@ -113,14 +113,14 @@ def read_log(
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
     records = _RecordCollector()
-    clip = read_clip(reader, config, records.tee(reader.records(*_record_types(config))), preprocess)
+    clip = read_clip(reader, config, records.tee(reader.records(*CLIP_RECORDS, GraspStatus)), preprocess)
     labelled = clip.labelled(preprocess.lead_in)
     if not labelled.any():
         raise DataError(
             f"{path} has no label after its first {preprocess.lead_in} frames, which the network needs as "
             "lead-in; record longer"
         )
-    forces_n, read_out = features(clip.frames)
+    forces_n, read_out = _by_reference(features, clip, preprocess)
     estimate_n = forces_n.mean(0).astype(np.float64)
     force_n = clip.forces_n.astype(np.float64)
     numbers = np.unique(touch_numbers(force_n)[labelled], return_inverse=True)[1]
@@ -139,6 +139,18 @@ def read_log(
         + 0.5 / config.camera.rate_hz
         + (estimate_lag_s if estimate_lag_s > 0 else 0.0),
         starts_in_contact=starts_in_contact(clip.forces_n, preprocess),
+    )
+
+
+def _by_reference(
+    features: Callable[[Gray], tuple[Singles, Singles]], clip: Clip, preprocess: Preprocess
+) -> tuple[Singles, Singles]:
+    """Returns the networks' forces, (M, T), and features, (T, F), of a clip, each part with its own reference."""
+    outputs = [features(part.frames) for part in clip.parts(preprocess)]
+    counts = np.diff((0, *clip.renewals, len(clip.frames)))  # a part begins with frames of the one before
+    return (
+        np.concatenate([forces_n[:, -n:] for (forces_n, _), n in zip(outputs, counts, strict=True)], axis=1),
+        np.concatenate([read_out[-n:] for (_, read_out), n in zip(outputs, counts, strict=True)]),
     )
 
 
@@ -181,12 +193,6 @@ class _RecordCollector:
             elif isinstance(record, LoadCellSample) and record.valid:
                 self.samples.append(record)
             yield record
-
-
-def _record_types(config: Config) -> list[type[Record]]:
-    """Types of records to read. Without a torque constant the servo's records are not used."""
-    types: list[type[Record]] = [Frame, LoadCellSample]
-    return types if config.gripper.nm_per_a is None else [*types, ServoState, GraspStatus]
 
 
 def _label_source(config: Config) -> dict[str, str | float | None]:

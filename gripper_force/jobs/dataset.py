@@ -4,10 +4,12 @@ import hashlib
 import json
 import math
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise, starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -18,10 +20,11 @@ from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
 from gripper_force.jobs.processes import process_pool
+from gripper_force.jobs.renewals import RenewalFinder
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree, as_path
-from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record, ServoState
+from gripper_force.types import NS_PER_MS, Event, Frame, Gray, LoadCellSample, Record, Request, ServoState
 
 if TYPE_CHECKING:  # labels need no OpenCV
     from gripper_force.vision.header import Header
@@ -29,6 +32,9 @@ if TYPE_CHECKING:  # labels need no OpenCV
 
 CONTACT_N: Final = 0.25
 """Measured force above which a frame counts as in contact."""
+
+CLIP_RECORDS: Final = (Frame, LoadCellSample, ServoState, Request, Event)
+"""Types of the records that make a clip."""
 
 _VIEW_KEYS: Final = (
     "camera_offset_m",
@@ -65,6 +71,7 @@ class Clip:
         indentation_m: Travel of the jaws since first contact at each frame, (T,) float32; NaN if unknown.
         rig: Settings of camera and gripper, see `gripper_force.config.Config.rig_settings`; empty if unknown.
         view: Camera and jaws of a simulated scene, as text; empty for a real one.
+        renewals: Numbers of the frames before which the run took a new reference, rising; see `parts`.
     """
 
     frames: Gray
@@ -77,6 +84,7 @@ class Clip:
     indentation_m: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     rig: Tree = field(default_factory=dict)
     view: str = ""
+    renewals: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Makes the indentation unknown where none is given."""
@@ -86,6 +94,26 @@ class Clip:
     def labelled(self, lead_in: int) -> npt.NDArray[np.bool_]:
         """Returns the mask of the frames with a label after the first ``lead_in``, which no run estimates; (T,)."""
         return self.valid & (np.arange(len(self.frames)) >= lead_in)
+
+    def parts(self, preprocess: "Preprocess") -> "list[Clip]":
+        """Returns the parts that the run compared with a reference each, which begin with the frames of theirs."""
+        if not self.renewals:
+            return [self]
+        lead = preprocess.reference_frames if preprocess.reference else 0
+        found = []
+        for begin, end in pairwise((0, *self.renewals, len(self.frames))):
+            at = slice(max(begin - lead, 0), end)
+            found.append(
+                replace(
+                    self,
+                    frames=self.frames[at],
+                    forces_n=self.forces_n[at],
+                    valid=self.valid[at],
+                    indentation_m=self.indentation_m[at],
+                    renewals=(),
+                )
+            )
+        return found
 
     @property
     def nominal_n(self) -> npt.NDArray[np.float32]:
@@ -145,7 +173,7 @@ def load_clips(
         progress: Called after each log.
 
     Returns:
-        One clip per log, in the order of `find_logs`.
+        One clip for each reference that a run took, in the order of `find_logs`: mostly one per log.
 
     Raises:
         DataError: There are no logs, or a log has no frames or no labels.
@@ -157,7 +185,7 @@ def load_clips(
     # Starting a process takes seconds.
     with nullcontext() if workers == 1 else process_pool(workers) as pool:
         for clip in map(read, paths) if pool is None else pool.map(read, paths):
-            clips.append(clip)
+            clips += [part for part in clip.parts(preprocess) if part.valid.any()]
             progress(f"read {clip.name}")
     return clips
 
@@ -332,10 +360,10 @@ def indentations(
 
 
 def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> Clip:
-    """Reads one log; see `load_clips`."""
+    """Reads one log as one clip; see `load_clips`."""
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
-    return read_clip(reader, config, reader.records(Frame, LoadCellSample, ServoState), preprocess, region)
+    return read_clip(reader, config, reader.records(*CLIP_RECORDS), preprocess, region)
 
 
 def read_clip(
@@ -350,7 +378,7 @@ def read_clip(
     Args:
         reader: The log.
         config: Its configuration.
-        records: Its records. All but frames, load-cell samples and servo states are ignored.
+        records: Its records. Those of other types than `CLIP_RECORDS` are ignored.
         preprocess: Determines the size that frames are downscaled to.
         region: Region of interest in pixels; None for the one in the configuration.
 
@@ -375,10 +403,35 @@ class StreamedClip:
         region: "Region | None" = None,
     ) -> None:
         self._reader, self._config, self._records = reader, config, records
-        self._region, self._size = region or config.vision.region, preprocess.size
+        self._region, self._preprocess = region or config.vision.region, preprocess
         self._t_ns = array("q")
         self._samples = CellSeries()
         self._servo_ns, self._position_rad = array("q"), array("d")
+        self._renewals: list[int] = []
+
+    def parts(self) -> Iterator[tuple[int, Iterator[Gray]]]:
+        """Yields the frames of each of `Clip.parts`, and how many of them are also in the part before.
+
+        Each part must be used up before the next one. Raises as `frames`.
+        """
+        frames = self.frames()
+        last: deque[Gray] = deque(maxlen=self._lead)
+        following = next(frames, None)
+
+        def part(count: int) -> Iterator[Gray]:
+            nonlocal following
+            yield from tuple(last)
+            while following is not None and len(self._renewals) == count:
+                last.append(following)
+                yield following
+                following = next(frames, None)
+
+        while following is not None:
+            yield len(last), part(len(self._renewals))
+
+    @property
+    def _lead(self) -> int:
+        return self._preprocess.reference_frames if self._preprocess.reference else 0
 
     def frames(self) -> Iterator[Gray]:
         """Yields the frames, cropped and downscaled, (S, S) uint8, once.
@@ -388,10 +441,15 @@ class StreamedClip:
         """
         from gripper_force.vision.preprocess import downscale
 
+        finder = RenewalFinder()
         for record in self._records:
+            is_renewed = finder.is_renewed(record)
             if isinstance(record, Frame):
+                # An earlier request changes nothing: the reference is still being collected.
+                if is_renewed and len(self._t_ns) >= max(self._lead, 1):
+                    self._renewals.append(len(self._t_ns))
                 self._t_ns.append(record.t_ns)
-                yield downscale(record.gray, self._region, self._size)
+                yield downscale(record.gray, self._region, self._preprocess.size)
             elif isinstance(record, LoadCellSample):
                 self._samples.add(record)
             elif isinstance(record, ServoState):
@@ -418,6 +476,8 @@ class StreamedClip:
         if not valid.any():
             raise DataError(f"{path} holds no valid load-cell sample near any frame; remove it from the logs")
         width_m = Transmission.from_config(config.gripper, servo_nm_per_a=1.0).width_m
+        servo_ns = np.array(self._servo_ns)
+        parts = starmap(slice, pairwise((0, *self._renewals, len(frame_t_ns))))
         return Clip(
             frames,
             forces_n,
@@ -426,9 +486,15 @@ class StreamedClip:
             config.object,
             metadata.get("set", path.stem),
             stiffness_of(metadata),
-            indentations(frame_t_ns, forces_n, np.array(self._servo_ns), self._position_rad, width_m),
+            np.concatenate(
+                [
+                    indentations(frame_t_ns[at], forces_n[at], servo_ns, self._position_rad, width_m)
+                    for at in parts
+                ]
+            ),
             config.rig_settings(),
             _view_of(metadata),
+            tuple(self._renewals),
         )
 
 

@@ -14,6 +14,7 @@ from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.errors import DataError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import (
+    CLIP_RECORDS,
     CONTACT_N,
     Clip,
     StreamedClip,
@@ -32,7 +33,6 @@ from gripper_force.profiles.apply import read_correction, read_profiles, with_bu
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree, as_path
-from gripper_force.types import Frame, LoadCellSample, ServoState
 from gripper_force.vision.model_files import read_model
 
 
@@ -245,8 +245,7 @@ def _evaluate_log(
             checkpoint = model.path, model.digest
     loaded = kept_checkpoint(*checkpoint)
     preprocess = loaded.header.preprocess
-    records = reader.records(Frame, LoadCellSample, ServoState)
-    streamed = StreamedClip(reader, logged, records, preprocess, settings.vision.region)
+    streamed = StreamedClip(reader, logged, reader.records(*CLIP_RECORDS), preprocess, settings.vision.region)
     if objects and logged.object not in objects:
         return None
     profiles = read_profiles(own)
@@ -254,7 +253,13 @@ def _evaluate_log(
     correction = None
     if settings.calibration.object is not None:
         correction = read_correction(own, profiles, loaded, logged.rig_settings())
-    forces_n = estimate_frames(loaded, streamed.frames(), correction, settings.vision.precision)
+    forces_n = np.concatenate(
+        [
+            estimate_frames(loaded, frames, correction, settings.vision.precision)[repeated:]
+            for repeated, frames in streamed.parts()
+        ]
+        or [np.empty(0, np.float32)]
+    )
     clip = streamed.clip(streamed.no_images)
     if starts_in_contact(clip.forces_n, preprocess) and not include_contact_starts:
         return _Evaluated(clip, None)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gripper_calibration.touch_logs import TouchRecording, join, read_log, touch_numbers
 from gripper_force.errors import DataError
 from gripper_force.runtime.log_writer import LogWriter
-from gripper_force.types import NS_PER_S, Frame, LoadCellSample
+from gripper_force.types import NS_PER_S, Frame, LoadCellSample, Record, Request, RequestKind
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.stream_inference import features
@@ -46,6 +46,38 @@ def read(path: Path, checkpoint: Path) -> TouchRecording:
     """Reads a log with the networks of a checkpoint."""
     engine = TorchEngine(read_model(checkpoint))
     return read_log(path, engine.header.preprocess, partial(features, engine))
+
+
+def test_each_reference_of_a_log_is_that_of_the_frames_after_it(
+    tmp_path: Path, tiny_checkpoint: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    touch_n = [0.0] * 10 + [2.0] * 20
+    records: list[Record] = []
+    for i, force_n in enumerate(touch_n * 2):
+        t_ns = i * NS_PER_S // 30
+        if i == 36:
+            records.append(Request(t_ns - 1, RequestKind.GRASP, 2.0, new_object=True))
+        records.append(Frame(t_ns, t_ns, i, rng.integers(0, 256, (48, 64), np.uint8)))
+        records.append(LoadCellSample(t_ns, force_n, 0.0))
+
+    def written(name: str, records: list[Record]) -> TouchRecording:
+        with LogWriter(tmp_path / name, config="object: mug", metadata={}) as log:
+            for record in records:
+                log.write(record)
+        return read(tmp_path / name, tiny_checkpoint)
+
+    begin = records.index(next(r for r in records if isinstance(r, Frame) and r.seq == 32))
+    whole, first, second = (
+        written(name, part)
+        for name, part in (("whole", records), ("first", records[:begin]), ("second", records[begin:]))
+    )
+    after = len(second.touches.estimate_n) - 1  # the last frame of the reference has an estimate of both
+    for key in ("estimate_n", "features"):
+        found = getattr(whole.touches, key)
+        np.testing.assert_array_equal(found[-after:], getattr(second.touches, key)[-after:])
+        of_first = getattr(first.touches, key)
+        np.testing.assert_array_equal(found[: len(of_first)], of_first)
 
 
 def test_join_refuses_logs_of_different_objects_cameras_or_load_cells(

@@ -8,9 +8,11 @@ import pytest
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import (
+    CLIP_RECORDS,
     CONTACT_N,
     NEAR_NS,
     Clip,
+    StreamedClip,
     digest,
     find_logs,
     indentations,
@@ -21,8 +23,18 @@ from gripper_force.jobs.dataset import (
     starts_in_contact,
     without_contact_starts,
 )
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
-from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
+from gripper_force.types import (
+    NS_PER_MS,
+    Event,
+    Frame,
+    LoadCellSample,
+    Record,
+    Request,
+    RequestKind,
+    ServoState,
+)
 from gripper_force.vision.preprocess import Preprocess, downscale
 
 SMALL = Preprocess(size=16)
@@ -33,14 +45,16 @@ def sample(t_ms: float, force_n: float, *, valid: bool = True) -> LoadCellSample
     return LoadCellSample(round(t_ms * MS), force_n, force_n, valid)
 
 
+def servo(t_ms: float, position_rad: float) -> ServoState:
+    return ServoState(round(t_ms * MS), position_rad, 0.0, 0.0, 30.0, 12.0, 0)
+
+
 def frame(t_ms: float, seq: int) -> Frame:
     gray = np.random.default_rng(seq).integers(0, 256, (30, 40), np.uint8)
     return Frame(round(t_ms * MS), round(t_ms * MS), seq, gray)
 
 
-def write_log(
-    path: Path, records: Iterable[Frame | LoadCellSample], metadata: dict[str, str], **config: object
-) -> None:
+def write_log(path: Path, records: Iterable[Record], metadata: dict[str, str], **config: object) -> None:
     with LogWriter(path, config=dump_config(Config.model_validate(config)), metadata=metadata) as log:
         for record in records:
             log.write(record)
@@ -108,6 +122,61 @@ def test_logs_become_clips(tmp_path: Path) -> None:
     np.testing.assert_allclose(b.forces_n[:3], [0.25, 2.0, 4.0], rtol=1e-6)
     (again,) = load_clips([tmp_path / "deep" / "b.mcap"], SMALL, region=(0, 0, 30, 30))
     np.testing.assert_array_equal(again.frames[0], downscale(frames[0].gray, (0, 0, 30, 30), 16))
+
+
+@pytest.mark.parametrize(
+    ("requested_ms", "refused", "begins"),
+    [
+        ((), False, [0]),
+        ((250,), False, [0, 9]),  # frame 12 is exposed at 240 ms; the four before frame 13 are the reference
+        ((245, 250), False, [0, 9]),
+        ((250, 350), False, [0, 9, 14]),
+        ((250,), True, [0]),
+        ((50,), False, [0]),  # the first reference is not complete
+        ((5000,), False, [0]),
+    ],
+)
+def test_a_log_is_a_clip_for_each_reference(
+    tmp_path: Path, requested_ms: tuple[int, ...], refused: bool, begins: list[int]
+) -> None:
+    forces_n = np.tile([0.0, 0, 0, 0, 0, 1, 2, 3, 0, 0], 3)
+    records: list[tuple[float, Record]] = []
+    for seq, force_n in enumerate(forces_n):
+        records.append((20 * seq, sample(20 * seq, force_n)))
+        records.append((20 * seq, frame(20 * seq, seq)))
+        records.append((20 * seq, servo(20 * seq, 0.5 if force_n else 0.0)))
+    for t_ms in requested_ms:
+        records.append((t_ms, Request(t_ms * MS, RequestKind.GRASP, 3.0, new_object=True)))
+        if refused:
+            records.append((t_ms, Event(t_ms * MS, "control", "refused 'grasp': an object is held")))
+    path = tmp_path / "a.mcap"
+    write_log(path, [record for _, record in sorted(records, key=lambda pair: pair[0])], {})
+    whole = load_clip(path, SMALL, None)
+    clips = load_clips(path, SMALL)
+    ends = [begin + SMALL.reference_frames for begin in begins[1:]] + [len(forces_n)]
+    assert whole.renewals == tuple(ends[:-1])
+    assert len(clips) == len(begins)
+    for part, begin, end in zip(clips, begins, ends, strict=True):
+        np.testing.assert_array_equal(part.frames, whole.frames[begin:end])
+        np.testing.assert_array_equal(part.forces_n, forces_n[begin:end])
+        assert part.valid.all()
+        assert part.renewals == ()
+        assert len(part.indentation_m) == end - begin
+    streamed = StreamedClip(LogReader(path), Config(), LogReader(path).records(*CLIP_RECORDS), SMALL)
+    parts = [(repeated, list(frames)) for repeated, frames in streamed.parts()]
+    assert [repeated for repeated, _ in parts] == [0] + [SMALL.reference_frames] * (len(begins) - 1)
+    for (_, frames), part in zip(parts, clips, strict=True):
+        np.testing.assert_array_equal(frames, part.frames)
+
+
+def test_a_part_without_labels_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    first = [frame(20 * seq, seq) for seq in range(10)]
+    then = [frame(20 * seq, seq) for seq in range(10, 20)]
+    request = Request(195 * MS, RequestKind.GRASP, 3.0, new_object=True)
+    write_log(path, [sample(0, 0.0), *first, request, *then], {})
+    (clip,) = load_clips(path, SMALL)
+    assert len(clip.frames) == 10
 
 
 @pytest.mark.parametrize("logs", [3, [3], None])

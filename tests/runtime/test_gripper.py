@@ -24,11 +24,14 @@ from hypothesis import strategies as st
 import gripper_force as gf
 from gripper_force.control import state_machine
 from gripper_force.control.limits import largest_target_n
+from gripper_force.jobs.evaluate import _evaluate_log
 from gripper_force.jobs.replay import replay
 from gripper_force.runtime import control_loop, process, session
 from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.session import Session
+from gripper_force.types import VisualForce
+from gripper_force.vision.model_files import read_model
 from gripper_hw.dynamixel.packets import Instruction, Parser
 from gripper_hw.dynamixel.pty_server import PtyServer
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, unregister_bus
@@ -315,6 +318,26 @@ def test_vision_takes_a_new_reference_with_a_new_object(
         share = gripper.grasp(3.0, new_object=new_object).vision_share
     assert share > 0.9 if new_object else share == 0
     assert replay(log).identical
+    seen_n = {visual.seq: visual.force_n for visual in LogReader(log).records(VisualForce)}
+    frames = [frame.seq for frame in LogReader(log).records(gf.Frame)]
+    model, settings_ = read_model("small"), gf.Config().model_dump(mode="json")
+    evaluated = _evaluate_log(
+        log,
+        checkpoint=(model.path, model.digest),
+        config=settings_,
+        objects=(),
+        include_contact_starts=False,
+    )
+    assert evaluated is not None
+    assert evaluated.forces_n is not None
+    compared = [
+        (seen_n[seq], force_n)
+        for seq, force_n in zip(frames, evaluated.forces_n, strict=True)
+        if seq in seen_n and math.isfinite(seen_n[seq])
+    ]
+    run_n, evaluated_n = np.array(compared).T
+    assert len(compared) > 100
+    np.testing.assert_allclose(evaluated_n, run_n, atol=1e-3)
 
 
 def test_a_camera_without_reference_frames_is_an_error_before_the_first_motion(

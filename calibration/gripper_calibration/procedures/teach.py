@@ -304,10 +304,10 @@ def _sorted_by_contact(
     """Returns the logs that can be used, those without contact, and those that start in contact."""
     used, without_contact, contact_starts = [], [], []
     for path in paths:
-        (clip,) = load_clips([path], model.header.preprocess)
-        if starts_in_contact(clip.forces_n, model.header.preprocess):
+        clips = load_clips([path], model.header.preprocess)
+        if starts_in_contact(clips[0].forces_n, model.header.preprocess):
             contact_starts.append(path)
-        elif (clip.forces_n > CONTACT_N).any():
+        elif any((clip.forces_n > CONTACT_N).any() for clip in clips):
             used.append(path)
         else:
             without_contact.append(path)
@@ -327,7 +327,7 @@ def _starts_in_contact(path: Path, preprocess: Preprocess) -> bool:
     except DataError:
         is_whole = False
     if not is_whole:  # the labels may come later in the log, or never
-        (clip,) = load_clips([path], preprocess)
+        clip = load_clips([path], preprocess)[0]
     return starts_in_contact(clip.forces_n, preprocess)
 
 

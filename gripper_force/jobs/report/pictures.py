@@ -10,11 +10,11 @@ import numpy.typing as npt
 from matplotlib import colormaps
 
 from gripper_force.config import config_from_text
-from gripper_force.control.state_machine import refused_ns
 from gripper_force.errors import CheckpointError, DataError, NonFiniteError, UnfamiliarFrameError
+from gripper_force.jobs.renewals import RenewalFinder
 from gripper_force.jobs.report.run import Run
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.types import GRIPPING, NS_PER_S, Event, Frame, Gray, Record, Request
+from gripper_force.types import GRIPPING, NS_PER_S, Frame, Gray, Record
 from gripper_force.vision.preprocess import downscale
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class FrameSampler:
         self._region = config.vision.region
         used = log.metadata.get("checkpoint", "")
         self._estimator, self._note = _open_estimator(config, used, any_checkpoint=changed is not None)
-        self._renewal_ns: int | None = None
+        self._renewals = RenewalFinder()
         self._kept: list[_Candidate] = []
         self._step = 1
         self._count = 0
@@ -116,22 +116,18 @@ class FrameSampler:
         Raises:
             ConfigError: The region of interest reaches beyond the frame.
         """
-        if isinstance(record, Request) and record.new_object:
-            self._renewal_ns = record.t_ns
-        elif isinstance(record, Event) and self._renewal_ns in refused_ns([record]):
-            self._renewal_ns = None
-        elif isinstance(record, Frame):
-            self._add_frame(record)
+        is_renewed = self._renewals.is_renewed(record)
+        if isinstance(record, Frame):
+            self._add_frame(record, is_renewed=is_renewed)
 
-    def _add_frame(self, frame: Frame) -> None:
+    def _add_frame(self, frame: Frame, *, is_renewed: bool) -> None:
         attention = None
         if self._estimator is not None:
             # The run continued without an estimate for such a frame, too. If the checks rejected it, the network did
             # not see it, and the newest attention is that of an earlier frame.
             seen = True
             try:
-                if self._renewal_ns is not None and frame.t_ns > self._renewal_ns:
-                    self._renewal_ns = None
+                if is_renewed:
                     self._estimator.renew_reference()
                 self._estimator.update(frame.gray)
             except UnfamiliarFrameError as error:
