@@ -73,16 +73,14 @@ format: setup-dev
 setup: $(VENV)/installed
 setup-dev: $(VENV)/installed-dev
 
-$(VENV)/installed: pyproject.toml scripts/system-packages
+$(VENV)/installed: EXTRAS := report,sim,train
+$(VENV)/installed-dev: EXTRAS := dev,engines,oak,report,sim,train
+$(VENV)/installed $(VENV)/installed-dev: pyproject.toml scripts/system-packages
 	PYTHON=$(PYTHON) scripts/system-packages $(EGL_PACKAGES)
 	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
 	test "$$(uname)" != Linux || $(PIP) --retries 0 --timeout 10 --index-url $(CPU_INDEX) --no-deps '$(TORCH)' 2>/dev/null || true
-	$(PIP) --editable '.[report,sim,train]'
-	touch $@
-
-$(VENV)/installed-dev: $(VENV)/installed
-	$(PIP) --editable '.[dev,engines,oak,report,sim,train]'
-	touch $@
+	$(PIP) --editable '.[$(EXTRAS)]'
+	touch $(VENV)/installed $@  # what is for development contains the rest
 
 clean:
 	rm -rf $(VENV) .venv-*
