@@ -79,12 +79,6 @@ def test_read_only_registers_refuse_writes(name):
     assert write(VirtualServo(1, MODEL), name, 0) is Error.ACCESS
 
 
-def test_model_lacks_registers_of_other_models():
-    startup = REGISTERS["startup_configuration"].address
-    assert VirtualServo(1, COMPLETE).read(startup, 1) == (Error.NONE, b"\0")
-    assert VirtualServo(1, MODEL).read(startup, 1) == (Error.ACCESS, b"")
-
-
 @pytest.mark.parametrize(
     "name", [name for name, entry in REGISTERS.items() if entry.access == "rw" and entry.eeprom]
 )
@@ -188,11 +182,6 @@ def test_indirect_data_reads_and_writes_its_target(model, firmware, address, dat
     assert servo.read(data, 3) == (Error.NONE, b"\x01\x39\x01")
     assert servo.write(data + 1, b"\x01") is Error.DATA_LENGTH
     assert servo.write(address, (10).to_bytes(2, "little")) is Error.DATA_RANGE
-
-
-def test_indirect_windows_of_another_firmware_are_absent():
-    assert VirtualServo(1, load_model("XL330-M288"), 52).read(248, 1)[0] is Error.ACCESS
-    assert VirtualServo(1, load_model("XL330-M288"), 51).read(248, 1)[0] is Error.NONE
 
 
 def test_mode_change_resets_the_goal_current():
