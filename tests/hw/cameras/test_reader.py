@@ -38,7 +38,7 @@ def test_start_fails_without_a_first_frame(monkeypatch: pytest.MonkeyPatch) -> N
     camera.close()
 
 
-def test_exception_of_thread_is_raised_by_start_and_newest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_of_thread_is_raised_by_start_and_newest() -> None:
     camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
     camera.read = lambda: 1 // 0  # type: ignore[assignment, return-value]
     with pytest.raises(ZeroDivisionError):

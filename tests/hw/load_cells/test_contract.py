@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import pytest
 
 from gripper_force.config import Config, LoadCellConfig, load_config
-from gripper_force.errors import DeviceError
 from gripper_force.interfaces import Clock, LoadCell
 from gripper_force.runtime.backends import LOAD_CELLS, MonotonicClock
 from gripper_force.runtime.log_writer import LogWriter
@@ -109,17 +108,6 @@ class TestHx711LoadCell(NumberedContract):
 
     def number(self, sample: LoadCellSample) -> int:
         return round(sample.raw * self.numbers_per_raw)
-
-    def test_port_is_exclusive_until_closed(
-        self, load_cell: LoadCell, second_load_cell: LoadCell, collect
-    ) -> None:
-        load_cell.start()
-        with pytest.raises(DeviceError) as caught:
-            second_load_cell.start()
-        assert "\n" not in str(caught.value)
-        load_cell.close()
-        second_load_cell.start()
-        collect(second_load_cell, 1)
 
     def test_unplugged_load_cell_is_read_again_when_it_is_back(
         self, board, load_cell: SerialLoadCell, collect, wait_until

@@ -71,19 +71,6 @@ def test_recorded_speed_keeps_pace_and_shifts_times(log: Path) -> None:
     assert played == recorded_frames(log)
 
 
-def test_slow_reader_skips_frames(log: Path) -> None:
-    clock = ManualClock(0)
-    camera = camera_of(log, clock)
-    camera.start()
-    assert camera.newest() is None
-    clock.t_ms = 100
-    frame = camera.newest()
-    assert frame is not None
-    assert frame.seq == 4
-    assert camera.newest() is None
-    assert not camera.finished
-
-
 def test_full_speed_returns_every_frame_as_recorded(log: Path) -> None:
     camera = camera_of(log, ManualClock(7), "full")
     camera.start()
@@ -134,18 +121,6 @@ def test_full_speed_returns_all_samples_at_once(log: Path) -> None:
     cell.start()
     assert cell.drain() == list(LogReader(log).records(LoadCellSample))
     assert cell.drain() == []
-
-
-def test_closed_devices_return_nothing(log: Path) -> None:
-    clock = ManualClock(0)
-    devices = camera_of(log, clock), load_cell_of(log, clock)
-    for device in devices:
-        device.start()
-        device.close()
-        device.close()
-    clock.t_ms = 500
-    assert devices[0].newest() is None
-    assert devices[1].drain() == []
 
 
 def test_log_without_data_of_sensor_is_refused(tmp_path: Path) -> None:

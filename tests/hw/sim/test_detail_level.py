@@ -87,11 +87,3 @@ def test_rig_simulates_selected_level_and_gives_the_reason(quick: list[str]) -> 
 def test_rig_refuses_unresolved_level(quick: list[str]) -> None:
     with pytest.raises(ConfigError, match=r"sim\.detail is still auto; "):
         SimulatedRig(load_config(None, [*quick, "sim.detail=auto"]))
-
-
-def test_rig_resolves_level(quick: list[str]) -> None:
-    config = load_config(None, [*quick, "sim.detail=auto", "budget.sim_error_n=0.05"])
-    resolved, reason = SimulatedRig.resolve(config)
-    assert resolved.sim.detail == "medium"
-    assert reason.startswith("chose sim.detail=medium ")
-    assert resolve_simulation(resolved) == (resolved, "")

@@ -66,11 +66,6 @@ def travel_m(name: str, size: float = 1.0, stiffness: float = 1.0) -> float:
     return end_m - start_m
 
 
-def test_error_of_unknown_object_lists_known_ones() -> None:
-    with pytest.raises(ConfigError, match="no simulated object 'egg'; there are sponge, paper_cup, tube"):
-        build_object("egg", "coarse", 1.0, 1.0)
-
-
 @pytest.mark.parametrize("detail", DETAILS)
 @pytest.mark.parametrize("name", OBJECTS)
 def test_untouched_object_does_not_move(name: str, detail: str) -> None:
