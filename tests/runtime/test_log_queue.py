@@ -64,7 +64,7 @@ def test_all_is_written_in_order(gate: Gate, path: Path, lockstep: bool) -> None
 
 
 @pytest.mark.parametrize("lockstep", [True, False])
-def test_a_disk_that_fails_is_told_at_the_end(gate: Gate, path: Path, lockstep: bool) -> None:
+def test_a_disk_that_fails_is_told_at_the_end(gate: Gate, lockstep: bool) -> None:
     log_queue = LogQueue(gate, lockstep=lockstep)  # type: ignore[arg-type]
     log_queue.write(events(1)[0])
     if not lockstep:

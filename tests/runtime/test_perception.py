@@ -110,14 +110,6 @@ def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> Non
     assert seen.attention.gray.tolist() == [[0, 102], [153, 255]]  # to its own range
 
 
-def test_the_reference_frame_is_seen_and_gives_no_estimate() -> None:
-    clock, camera = Hand(), Shutter()
-    perception = LockstepPerception(camera, FakeEstimator(), clock, compute_ms=0.0)
-    camera.give(0)
-    (seen,) = perception.poll()
-    assert (seen.frame.seq, seen.visual) == (0, None)
-
-
 def test_in_lockstep_no_frame_is_taken_while_the_last_is_under_way() -> None:
     clock, camera, estimator = Hand(), Shutter(), FakeEstimator()
     perception = LockstepPerception(camera, estimator, clock, compute_ms=12.0)
@@ -267,17 +259,6 @@ def test_what_stops_the_thread_is_raised_by_poll(error: Exception) -> None:
     with pytest.raises(type(error), match="no "):
         gather(perception, 1)
     perception.close()
-
-
-def test_a_thread_survives_a_later_error() -> None:
-    camera = Shutter()
-    for seq in range(5):
-        camera.give(seq)
-    perception = ThreadedPerception(camera, FakeEstimator(RuntimeError("no kernel"), at=3), Hand())
-    perception.start()
-    seen = gather(perception, 5)
-    perception.close()
-    assert [s.problem for s in seen] == ["", "", "RuntimeError: no kernel", "", ""]
 
 
 def test_closing_leaves_no_thread_started_or_not() -> None:

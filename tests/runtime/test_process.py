@@ -7,7 +7,6 @@ from types import FrameType
 
 import pytest
 
-from gripper_force.runtime import process
 from gripper_force.runtime.process import PRIORITY, deferred_signals, interrupt_exit_code, real_time_priority
 
 
@@ -116,18 +115,6 @@ def in_another_thread(stack: ExitStack) -> None:
 
 
 @pytest.mark.usefixtures("own_process")
-def test_a_signal_after_an_end_in_another_thread_is_handled_as_before() -> None:
-    before, calls = signal.getsignal(signal.SIGINT), list[str]()
-    stack = ExitStack()
-    stack.enter_context(deferred_signals(lambda _: calls.append("ended")))
-    in_another_thread(stack)
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-    assert calls == []
-    assert signal.getsignal(signal.SIGINT) == before
-
-
-@pytest.mark.usefixtures("own_process")
 def test_the_handlers_return_when_the_next_gripper_is_closed() -> None:
     before = signal.getsignal(signal.SIGTERM)
     stack = ExitStack()
@@ -186,17 +173,6 @@ def test_only_a_second_ctrl_c_interrupts_again() -> None:
         signal.raise_signal(signal.SIGINT)
     assert len(calls) == 2
     assert interrupt_exit_code() == 128 + signal.SIGHUP
-
-
-@pytest.mark.usefixtures("own_process")
-def test_a_signal_some_time_after_another_interrupts_what_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program may have handled the first one."""
-    monkeypatch.setattr(process, "_TOGETHER_S", -1.0)
-    calls: list[bool] = []
-    with deferred_signals(calls.append):
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGTERM):
-            signal.raise_signal(number)
-    assert calls == [True, False, False]
 
 
 @pytest.mark.usefixtures("own_process")

@@ -77,14 +77,6 @@ def test_requests_are_handled_in_their_order(cycle: Cycle) -> None:
     assert [cycle.run(Phase.MOVE) for _ in range(4)] == [*requests, None]
 
 
-def test_a_request_ends_with_the_outcome(cycle: Cycle) -> None:
-    grasp = cycle.submit(RequestKind.GRASP)
-    cycle.run(Phase.APPROACH)
-    assert not grasp.result.done()
-    cycle.run(Phase.HOLD, Outcome.HELD)
-    assert grasp.result.result(timeout=0).outcome == Outcome.HELD
-
-
 def test_a_refused_request_fails_alone(cycle: Cycle) -> None:
     grasp = cycle.submit(RequestKind.GRASP)
     cycle.run(Phase.APPROACH)
@@ -94,23 +86,6 @@ def test_a_refused_request_fails_alone(cycle: Cycle) -> None:
     assert not grasp.result.done()
     cycle.run(Phase.HOLD, Outcome.HELD)
     assert grasp.result.result(timeout=0).held
-
-
-def test_each_refusal_reaches_its_own_caller(cycle: Cycle) -> None:
-    first, second = cycle.submit(RequestKind.RELEASE), cycle.submit(RequestKind.RELEASE)
-    cycle.run(Phase.FAULT, refusal="too hot")
-    cycle.run(Phase.FAULT, refusal="too cold")
-    assert failure(first).endswith("too hot")
-    assert failure(second).endswith("too cold")
-
-
-@pytest.mark.parametrize("outcome", [Outcome.NONE, Outcome.FAULT])
-def test_a_newer_request_of_another_kind_replaces(cycle: Cycle, outcome: Outcome) -> None:
-    grasp = cycle.submit(RequestKind.GRASP)
-    cycle.run(Phase.APPROACH)
-    release = cycle.submit(RequestKind.RELEASE, wait=False)
-    assert cycle.run(Phase.RELEASE, outcome) is release
-    assert failure(grasp) == "the grasp request was replaced by a release request"
 
 
 def test_the_request_that_replaces_a_grasp_of_a_new_object_is_one_too(cycle: Cycle) -> None:
@@ -129,29 +104,6 @@ def test_callers_of_the_same_kind_get_the_same_result(cycle: Cycle) -> None:
     cycle.run(Phase.RAMP)
     cycle.run(Phase.HOLD, Outcome.HELD)
     assert first.result.result(timeout=0) is second.result.result(timeout=0)
-
-
-@pytest.mark.parametrize("kind", [RequestKind.GRASP, RequestKind.MOVE])
-def test_at_fault_only_a_release_is_accepted(cycle: Cycle, kind: RequestKind) -> None:
-    cycle.state = replace(STATE, reason="too hot")
-    cycle.run(Phase.FAULT, Outcome.FAULT)
-    with pytest.raises(
-        RequestError, match=rf"the {kind} request was refused: stopped or in fault \(too hot\);"
-    ):
-        cycle.submit(kind)
-    cycle.submit(RequestKind.RELEASE)
-    cycle.submit(kind)  # the release before it may end the fault
-    cycle.stop()
-    with pytest.raises(RequestError, match="call release first"):
-        cycle.submit(kind)
-
-
-@pytest.mark.parametrize("phase", [Phase.OPEN, Phase.APPROACH, Phase.RELEASE, Phase.MOVE])
-def test_a_change_of_force_needs_an_object(cycle: Cycle, phase: Phase) -> None:
-    cycle.run(phase)
-    with pytest.raises(RequestError, match=rf"no object is gripped \(phase {phase}\)"):
-        cycle.submit(RequestKind.GRASP, needs_object=True)
-    assert cycle.queue.next() is None
 
 
 def test_a_stop_overrides_older_requests_and_precedes_newer_ones(cycle: Cycle) -> None:
@@ -186,14 +138,6 @@ def test_a_stop_during_a_cycle_overrides_in_the_next_one(cycle: Cycle) -> None:
 
 
 RESULT = (Outcome.HELD, 3.0, 0.1, 0.05, 0.0, "")
-
-
-def test_jaws_that_do_not_open_end_the_wait(cycle: Cycle) -> None:
-    release = cycle.submit(RequestKind.RELEASE)
-    cycle.run(Phase.RELEASE)
-    assert not release.result.done()
-    cycle.run(Phase.RELEASE, Outcome.BLOCKED)
-    assert release.result.result(timeout=0).outcome == Outcome.BLOCKED
 
 
 def test_closing_ends_every_call_and_refuses_later_ones(cycle: Cycle) -> None:

@@ -146,13 +146,6 @@ def events(path: Path) -> list[str]:
 # A whole grasp.
 
 
-@pytest.fixture(scope="module")
-def current_log(quick: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("current") / "grasp.mcap"
-    run_grasp(load_config(None, quick), path)
-    return path
-
-
 def test_a_grasp_goes_through_its_phases_and_is_held(current_log: Path) -> None:
     statuses = list(LogReader(current_log).records(GraspStatus))
     phases = [b.phase for a, b in pairwise(statuses) if a.phase != b.phase]
@@ -250,14 +243,6 @@ def test_a_target_over_the_limit_is_refused_before_anything_moves(quick: list[st
 # Every way out.
 
 
-def test_torque_is_off_after_a_normal_end(open_rig: tuple[ExitStack, OpenRig]) -> None:
-    run, begin = open_rig
-    rig = begin()
-    rig.grip()
-    run.close()
-    assert rig.is_off()
-
-
 @pytest.mark.parametrize(
     "error", [DataError("no picture"), KeyboardInterrupt(), RuntimeError("a bug"), SystemExit(3)]
 )
@@ -271,18 +256,6 @@ def test_torque_is_off_after_an_error_in_the_run(
         raise error
     assert rig.is_off()
     assert events(tmp_path / "run.mcap")[-1] == f"{type(error).__name__}: {error}"
-
-
-@pytest.mark.parametrize(("error", "torque"), [(DataError("no picture"), 0), (KeyboardInterrupt(), 1)])
-def test_an_exception_ends_the_run_like_a_fault_and_an_interrupt_like_an_exit(
-    open_rig: tuple[ExitStack, OpenRig], error: BaseException, torque: int
-) -> None:
-    run, begin = open_rig
-    rig = begin("on_exit=hold", "control.on_fault=limp")
-    rig.session.cycle()
-    with pytest.raises(type(error)), run:
-        raise error
-    assert rig.register("torque_enable") == torque
 
 
 def test_torque_is_off_after_the_devices_report_a_failure(open_rig: tuple[ExitStack, OpenRig]) -> None:
@@ -317,25 +290,6 @@ class Gray:
         t_ns = self.asked * 5 * NS_PER_MS
         gray = np.full((2, 2), self.asked % 251, np.uint8)
         return None if self.asked % 4 else Frame(t_ns, t_ns, self.asked // 4, gray)
-
-
-def test_the_jaws_open_although_the_camera_is_lost(
-    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path
-) -> None:
-    run, begin = open_rig
-    camera = Gray()
-    rig = begin("control.on_fault=open", camera=camera)
-    rig.grip()
-
-    def newest() -> Frame:
-        raise DeviceError("the camera is gone")
-
-    camera.newest = newest  # type: ignore[method-assign]
-    with pytest.raises(DeviceError, match="the camera is gone"), run:
-        rig.session.cycle()
-    last = list(LogReader(tmp_path / "run.mcap").records(GraspStatus))[-1]
-    assert last.width_m > 0.085
-    assert rig.is_off()
 
 
 @dataclasses.dataclass
@@ -656,19 +610,6 @@ def test_stop_soon_leads_to_fault_within_a_cycle(open_rig: tuple[ExitStack, Open
     assert all(d.command.goal_current_a <= before_a for d in after)
 
 
-@pytest.mark.parametrize("stopped", [False, True])
-def test_a_stop_after_the_last_cycle_ends_the_run_like_a_fault(quick: list[str], stopped: bool) -> None:
-    settings = resolve(load_config(None, [*quick, "on_exit=hold", "control.on_fault=limp"]))
-    with open_devices(settings.config) as devices:
-        bus = virtual.find_bus("rig")
-        assert bus is not None
-        with open_session(settings, devices, None) as session:
-            session.cycle(RequestKind.GRASP, 3.0)
-            if stopped:
-                session.stop_soon()
-        assert bus.servos[0].get("torque_enable") == (not stopped)
-
-
 @pytest.mark.usefixtures("own_process")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_waits_for_the_end_of_the_cycle(
@@ -867,14 +808,6 @@ def test_in_real_time_the_loop_runs_and_the_grasp_ends(
     assert 100 < len(states) <= ran_s * 200 + 10
     assert sys.getswitchinterval() == pytest.approx(interval)
     assert not {thread.name for thread in threading.enumerate()} & {"perception", "simulated-rig"}
-
-
-def test_a_session_needs_no_load_cell(open_rig: tuple[ExitStack, OpenRig], tmp_path: Path) -> None:
-    run, begin = open_rig
-    rig = begin("load_cell.backend=none")
-    rig.session.cycle()
-    run.close()
-    assert list(LogReader(tmp_path / "run.mcap").records(LoadCellSample)) == []
 
 
 def test_versions_are_those_of_installed_packages() -> None:

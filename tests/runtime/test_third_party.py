@@ -107,6 +107,10 @@ def config(quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def with_own(config: Config, unit: str, fails: str, **keys: object) -> Config:
+    """With this device of another package; with such a servo in real time, without sensors."""
+    if unit == "servo":
+        none = {"backend": "none"}
+        keys |= {"clock": "realtime", "camera": none, "load_cell": none}
     return config.with_values(**{unit: {"backend": UNITS[unit], "options": {"fails": fails}}}, **keys)
 
 
@@ -130,13 +134,11 @@ def test_a_device_that_can_not_be_opened_is_named(
 def test_a_device_that_can_not_be_closed_hides_neither_result_nor_error(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unit: str, error: Exception | None
 ) -> None:
-    realtime: dict[str, Any] = {"clock": "realtime", "camera": {"backend": "none"}}
-    keys = realtime | {"load_cell": {"backend": "none"}} if unit == "servo" else {}
     monkeypatch.setattr(import_module("own_devices").Servo, "stopped", stopped := list[bool]())
     named = rf"{unit}\.backend={UNITS[unit]}: {UNITS[unit].partition(':')[2]}\.close\(\) raised ValueError: no close here"
 
     def run() -> None:
-        own = with_own(config, unit, "close", **keys)
+        own = with_own(config, unit, "close")
         with open_run(own, tmp_path / "run.mcap") as session:
             session.wait_for_reference()
             if error is not None:
@@ -165,15 +167,12 @@ def test_a_device_that_can_not_be_closed_hides_neither_result_nor_error(
 def test_a_method_that_returns_something_else_is_named(
     config: Config, tmp_path: Path, unit: str, method: str
 ) -> None:
-    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}} if unit == "servo" else {}
-    clock = "realtime" if unit == "servo" else "lockstep"
-    own = with_own(config, unit, f"result of {method}", clock=clock, **none)
     named = f"{UNITS[unit]}: {UNITS[unit].partition(':')[2]}"
     sentence = (
         rf"{unit}\.backend={named}\.{method}\(\) returned str; return what gripper_force\.interfaces says$"
     )
     with pytest.raises(DeviceError, match=sentence):
-        run_grasp(own, tmp_path / "run.mcap")
+        run_grasp(with_own(config, unit, f"result of {method}"), tmp_path / "run.mcap")
     assert LogReader(tmp_path / "run.mcap").complete
 
 
@@ -290,9 +289,8 @@ def test_a_camera_at_the_end_does_not_hide_a_servo_that_does_not_stop(
 
 
 def test_a_servo_that_fails_is_told_to_stop(config: Config, tmp_path: Path) -> None:
-    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
     path = tmp_path / "run.mcap"
-    own = with_own(config, "servo", "write", clock="realtime", **none)
+    own = with_own(config, "servo", "write")
     with pytest.raises(DeviceError, match=rf"^servo\.backend=own_devices:Servo: Servo\.write\(\) .*{REMEDY}"):
         run_grasp(own, path)
     assert import_module("own_devices").Servo.stopped == [False]
@@ -302,8 +300,7 @@ def test_a_servo_that_fails_is_told_to_stop(config: Config, tmp_path: Path) -> N
 def test_a_servo_whose_start_returns_nothing_is_told_to_stop(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
-    own = with_own(config, "servo", "nothing", clock="realtime", **none)
+    own = with_own(config, "servo", "nothing")
     servo = import_module("own_devices").Servo
     monkeypatch.setattr(servo, "stopped", [])
     monkeypatch.setattr(servo, "start", lambda self: None)
@@ -387,8 +384,7 @@ def test_a_record_with_a_wrong_field_ends_the_run_at_once(
     sentence: str,
 ) -> None:
     path = tmp_path / "run.mcap"
-    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}} if unit == "servo" else {}
-    own = with_own(config, unit, "", clock="realtime" if unit == "servo" else "lockstep", **none)
+    own = with_own(config, unit, "")
     module = import_module("own_devices")
     right = getattr(getattr(module, UNITS[unit].partition(":")[2]), method)
 
@@ -417,8 +413,7 @@ def test_a_record_with_a_wrong_field_ends_the_run_at_once(
 def test_a_servo_whose_time_stands_still_ends_the_run(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
-    own = with_own(config, "servo", "", clock="realtime", **none)
+    own = with_own(config, "servo", "")
     servo = import_module("own_devices").Servo
     state = ServoState(time.monotonic_ns(), 0.0, 0.0, 0.0, 30.0, 12.0, 0)
     monkeypatch.setattr(servo, "stopped", [])
@@ -429,8 +424,7 @@ def test_a_servo_whose_time_stands_still_ends_the_run(
 
 
 def test_a_servo_without_counters_is_named(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
-    own = resolve(with_own(config, "servo", "", clock="realtime", **none))
+    own = resolve(with_own(config, "servo", ""))
     monkeypatch.setattr(import_module("own_devices").Servo, "stats", None)
     with (
         pytest.raises(
