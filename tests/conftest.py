@@ -93,7 +93,6 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from gripper_force.vision.checkpoint_writer import save_checkpoint
     from gripper_force.vision.header import Header, NetworkConfig, Residual
     from gripper_force.vision.network import ForceNetwork
-    from gripper_force.vision.preprocess import Preprocess
 
     torch.manual_seed(0)
     members = tuple(
@@ -147,7 +146,6 @@ def servo_calibration() -> ServoCalibration:
 @pytest.fixture(scope="session")
 def current_log(quick: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole lockstep grasp on motor current alone. Not to be written to."""
-    from gripper_force.config import load_config
     from gripper_force.jobs.grasp import run_grasp
 
     path = tmp_path_factory.mktemp("current") / "grasp.mcap"
@@ -158,7 +156,6 @@ def current_log(quick: list[str], tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.fixture(scope="session")
 def fused_log(quick_vision: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole lockstep grasp with vision. Not to be written to."""
-    from gripper_force.config import load_config
     from gripper_force.jobs.grasp import run_grasp
 
     path = tmp_path_factory.mktemp("fused") / "grasp.mcap"

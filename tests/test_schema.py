@@ -10,7 +10,6 @@ from gripper_force.errors import ConfigError
 from gripper_force.schema import (
     Section,
     Tree,
-    assign,
     dump,
     merged,
     read_tree,
@@ -64,12 +63,6 @@ def test_a_wrong_value_is_named_with_what_it_is_of() -> None:
         validated(Whole, {"part": {"size": "big"}}, "there", "profile")
     with pytest.raises(ConfigError, match="can't read the profile there"):
         tree_from("a: [1", "there", "profile")
-
-
-def test_an_assignment_makes_the_sections_it_needs() -> None:
-    tree: Tree = {}
-    assign(tree, "a.b=[1, 2]")
-    assert tree == {"a": {"b": [1, 2]}}
 
 
 def test_a_key_that_occurs_twice_is_refused(tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def test_trials_that_hold_nothing_end_with_code_1(run: Run, sets: list[str]) -> 
     assert run("grasp", "--trials", 1, "--jobs", 1, "--object", "none", *sets).code == 1
 
 
-def test_wrong_names_end_the_command_before_its_work(run: Run, fused_log: Path, tmp_path: Path) -> None:
+def test_wrong_names_end_the_command_before_its_work(run: Run, fused_log: Path) -> None:
     found = run("train", fused_log, "--hold-out", "spnge")
     assert (found.code, "--hold-out: no log is of spnge; there are stapler" in found.err) == (2, True), (
         found.err
@@ -586,23 +586,6 @@ def test_a_truncated_log_is_refused_and_recovered_on_request(
     assert recovered.err.splitlines()[-1] == f"next: gripper-force replay {path} --recover --report"
 
 
-def test_a_file_that_is_no_checkpoint_is_named(
-    run: Run, fused_log: Path, tiny_checkpoint: Path, tmp_path: Path
-) -> None:
-    from safetensors.torch import load_file, save_file
-
-    garbage, foreign, short = (tmp_path / f"{n}.safetensors" for n in ("garbage", "foreign", "short"))
-    garbage.write_bytes(b"no weights" * 100)
-    save_file(load_file(tiny_checkpoint), foreign)
-    short.write_bytes(tiny_checkpoint.read_bytes()[:-100])
-    for path, sentence in ((garbage, "damaged"), (foreign, "is not a gripper-force"), (short, "damaged")):
-        done = run("replay", fused_log, "--checkpoint", path, "--set", "vision.engine=torch")
-        assert done.code == 2
-        (line,) = done.err.splitlines()
-        assert str(path) in line
-        assert sentence in line
-
-
 def test_a_report_can_be_that_of_a_replay(run: Run, current_log: Path, tmp_path: Path) -> None:
     log = Path(shutil.copy(current_log, tmp_path / "run.mcap"))
     done = run("replay", log, "--report", "--set", "control.ramp_n_s=4", "--json")
@@ -792,21 +775,15 @@ def test_an_imported_recording_that_starts_in_contact_is_named(run: Run, tmp_pat
 
 
 def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
-    video, table = write_recording(tmp_path)
-    table.unlink()
+    video, _ = write_recording(tmp_path)
     assert "needs its load-cell table" in run("import", "video", video).err
     missing = tmp_path / "missing.avi"
     assert f"there is no {missing}" in run("import", "video", missing).err
-    done = run("import", "video", video, table)
-    assert done.code == 2
-    assert "can't read the table" in done.err
-    assert "touch.avi has no table of forces" in run("import", "video", tmp_path).err
 
 
 @pytest.mark.parametrize(("flags", "warned"), [("avx2", True), ("avx512_bf16", False)])
 def test_bfloat16_on_a_cpu_that_emulates_it_is_warned_of(
     run: Run,
-    tmp_path: Path,
     tiny_checkpoint: Path,
     fused_log: Path,
     flags: str,
@@ -824,12 +801,6 @@ def test_an_empty_folder_has_nothing_to_evaluate(run: Run, tmp_path: Path, tiny_
     done = run("evaluate", tmp_path, "--checkpoint", tiny_checkpoint)
     assert (done.code, done.out) == (2, "")
     assert "no logs (*.mcap)" in done.err
-
-
-def test_wrong_usage_is_told_by_the_parser(run: Run) -> None:
-    done = run("grasp", "--jobs", "0")
-    assert done.code == 2
-    assert "Traceback" not in done.err
 
 
 # In between.

@@ -1,5 +1,4 @@
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from gripper_force import cli
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import doctor
-from gripper_force.jobs.checks import Check, judged, keep_only, rate_hz, time_ms
+from gripper_force.jobs.checks import Check, judged, keep_only, rate_hz
 
 
 @pytest.fixture
@@ -181,18 +180,6 @@ def test_only_one_sensor_is_kept() -> None:
 def test_a_rate_counts_what_is_between() -> None:
     assert rate_hz([0, 10_000_000, 20_000_000]) == pytest.approx(100.0)
     assert np.isfinite(rate_hz([5, 5]))
-
-
-def test_a_call_is_timed_as_often_as_asked() -> None:
-    calls: list[int] = []
-
-    def call() -> None:
-        time.sleep(0.001)
-        calls.append(1)
-
-    median_ms, p99_ms = time_ms(call, 7)
-    assert len(calls) == 7
-    assert p99_ms >= median_ms >= 1.0
 
 
 def test_advice_is_for_what_is_not_good() -> None:

@@ -119,12 +119,6 @@ def test_an_objects_name_is_no_formula(tmp_path: Path) -> None:
     assert colours(tmp_path / "names.png") > 100
 
 
-def test_figure_that_cannot_be_written_raises(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DataError, match="can't write the figure"):
-        draw_grasps([summary(4.0, 0.1)], "a title", tmp_path / "file" / "a.png")
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
 def test_a_full_disk_is_named_without_its_number(tmp_path: Path) -> None:
     (tmp_path / "a.png").symlink_to("/dev/full")

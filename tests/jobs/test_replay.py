@@ -20,6 +20,7 @@ from gripper_force.jobs import replay as job
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
+from gripper_force.jobs.profile_files import update_rig
 from gripper_force.jobs.replay import replay, replay_each, replay_frames
 from gripper_force.jobs.replay.comparison import (
     Columns,
@@ -31,6 +32,7 @@ from gripper_force.jobs.replay.comparison import (
 from gripper_force.jobs.replay.feed import changed_config, resolve_replay, run_again
 from gripper_force.jobs.report import ReportPaths
 from gripper_force.jobs.report.figure import draw
+from gripper_force.profiles.rig_profile import ServoCalibration
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
@@ -176,36 +178,6 @@ def test_an_override_changes_decisions(fused_log: Path) -> None:
     assert same.changed == {"goal_current_a": 0, "fused_n": 0}
 
 
-def test_a_truncated_log_is_read_only_where_that_is_asked_for(fused_log: Path, tmp_path: Path) -> None:
-    path = tmp_path / "cut.mcap"
-    data = fused_log.read_bytes()
-    path.write_bytes(data[: len(data) * 2 // 3])
-    with pytest.raises(
-        LogError, match=r"is cut short, damaged or not finished yet: .* are left; .* --recover"
-    ):
-        replay(path)
-    result = replay(path, recover=True)
-    assert result.identical is True
-    assert 100 < result.frames < replay(fused_log).frames
-
-
-RIG = """
-format: gripper-force-rig/1
-servo:
-  date: 2025-01-01T00:00:00Z
-  model: XM430-W350
-  nm_per_a: {value: 1.78}
-  friction_n: {value: 0.95}
-  damping_n_s_m: {value: 14.5}
-  pinion_radius_m: {value: 0.02}
-  open_position_rad: {value: 0.0}
-  open_width_m: 0.092
-  force_n: [0, 12]
-  speed_m_s: [0, 0.05]
-  residual_n: 0.1
-"""
-
-
 def test_log_without_a_load_cell_has_no_errors(
     short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,9 +206,11 @@ def test_log_without_a_load_cell_has_no_errors(
     assert summarise_replays(results).sources["fused"].frames == results[0].sources["fused"].frames
 
 
-def test_log_is_replayed_without_the_file_of_its_rig_profile(quick: list[str], tmp_path: Path) -> None:
+def test_log_is_replayed_without_the_file_of_its_rig_profile(
+    quick: list[str], servo_calibration: ServoCalibration, tmp_path: Path
+) -> None:
     rig = tmp_path / "rig.yaml"
-    rig.write_text(RIG)
+    update_rig(rig, servo_calibration)
     log = tmp_path / "run.mcap"
     run_grasp(load_config(None, [*quick, f"calibration.rig={rig}"]), log)
     rig.unlink()

@@ -167,13 +167,17 @@ def write_grasp(
     return path
 
 
-def write_recording(path: Path) -> Path:
-    """An imported recording: frames and load-cell samples only."""
+RISING_N = [0.1 * i for i in range(40)]
+
+
+def write_recording(folder: Path, forces_n: list[float]) -> Path:
+    """An imported recording of an egg: a frame and a load-cell sample each 20 ms, and nothing else."""
+    path = folder / "egg.mcap"
     with LogWriter(path, config=dump_config(config_from({"object": "egg"}, "")), metadata={}) as log:
-        for i in range(40):
-            t_ns = i * 33 * NS_PER_MS
-            log.write(Frame(t_ns, t_ns, i, picture(0.1 * i)))
-            log.write(LoadCellSample(t_ns, 0.1 * i, 0.1 * i))
+        for i, force_n in enumerate(forces_n):
+            t_ns = i * 20 * NS_PER_MS
+            log.write(Frame(t_ns, t_ns, i, picture(force_n)))
+            log.write(LoadCellSample(t_ns, force_n, force_n))
     return path
 
 
@@ -254,8 +258,8 @@ def test_report_is_written_next_to_its_log(grasp: Path) -> None:
     assert image.shape[1] >= 1200
 
 
-def test_report_in_another_folder_is_the_same_and_is_read_and_drawn_once(
-    grasp: Path, page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_report_made_again_is_the_same_and_its_log_is_read_and_drawn_once(
+    grasp: Path, page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     times_ns, drawn = [], []
 
@@ -270,9 +274,7 @@ def test_report_in_another_folder_is_the_same_and_is_read_and_drawn_once(
 
     monkeypatch.setattr(log_reader_module, "breakup_chunk", count)
     monkeypatch.setattr(report_module, "draw", kept)
-    paths = write_report(grasp, tmp_path / "elsewhere")
-    assert paths.png.parent == paths.html.parent == tmp_path / "elsewhere"
-    assert paths.html.read_text(encoding="utf-8") == page
+    assert write_report(grasp).html.read_text(encoding="utf-8") == page
     assert len(times_ns) == len(set(times_ns)) > 50
     assert len(drawn) == 1
 
@@ -355,11 +357,7 @@ def test_a_simulated_run_says_so_and_shows_no_simulated_latency(tmp_path: Path) 
 
 @pytest.mark.usefixtures("_undrawn")
 def test_each_touch_of_several_has_a_card(tmp_path: Path) -> None:
-    path = tmp_path / "touches.mcap"
-    with LogWriter(path, config=dump_config(config_from({"object": "egg"}, "")), metadata={}) as log:
-        for i in range(400):
-            t_ns = i * 20 * NS_PER_MS
-            log.write(LoadCellSample(t_ns, 5.0 if 100 <= i < 150 else 3.0 if 250 <= i < 300 else 0.01, 0.0))
+    path = write_recording(tmp_path, 100 * [0.01] + 50 * [5.0] + 100 * [0.01] + 50 * [3.0] + 100 * [0.01])
     assert [(touch.start_s, touch.peak_n) for touch in read_run(LogReader(path)).touches] == [
         (2.0, 5.0),
         (5.0, 3.0),
@@ -510,24 +508,14 @@ def test_attention_follows_a_new_object_unless_it_was_refused(
 
 
 def test_frames_of_recording_span_its_touch(tmp_path: Path) -> None:
-    path = tmp_path / "egg.mcap"
-    with LogWriter(path, config="", metadata={}) as log:
-        for i in range(300):
-            t_ns = i * 20 * NS_PER_MS
-            log.write(Frame(t_ns, t_ns, i, picture(0.0)))
-            log.write(LoadCellSample(t_ns, 5.0 if 100 <= i < 200 else 0.01, 0.0))
-    _, pictures, note = read(path)
+    _, pictures, note = read(write_recording(tmp_path, 100 * [0.01] + 100 * [5.0] + 100 * [0.01]))
     assert [round(p.t_s, 1) for p in pictures] == [1.7, 2.2, 2.7, 3.2, 3.8, 4.3]
     assert note == ""
 
 
 def test_long_log_keeps_few_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures_module, "_KEPT", 20)
-    path = tmp_path / "egg.mcap"
-    with LogWriter(path, config="", metadata={}) as log:
-        for i in range(300):
-            log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, picture(0.0)))
-    reader = LogReader(path)
+    reader = LogReader(write_recording(tmp_path, 300 * [0.0]))
     sampler = FrameSampler(reader)
     kept = []
 
@@ -552,7 +540,7 @@ def test_attention_of_another_checkpoint_is_not_shown(tmp_path: Path) -> None:
 
 
 def test_report_of_recording_without_a_run(tmp_path: Path) -> None:
-    paths = write_report(write_recording(tmp_path / "egg.mcap"))
+    paths = write_report(write_recording(tmp_path, RISING_N))
     parsed = Page(paths.html.read_text(encoding="utf-8"))
     assert "Egg" in parsed.text
     assert "Force" in parsed.text
@@ -581,10 +569,10 @@ def test_truncated_log_is_reported_with_recover(grasp: Path, tmp_path: Path) -> 
 
 @pytest.mark.usefixtures("_undrawn")
 def test_report_that_cannot_be_written_raises(tmp_path: Path) -> None:
-    log = write_recording(tmp_path / "egg.mcap")
-    (tmp_path / "file").touch()
+    log = write_recording(tmp_path, RISING_N)
+    log.with_suffix(".html").mkdir()
     with pytest.raises(LogError, match="can't write the report"):
-        write_report(log, tmp_path / "file" / "below")
+        write_report(log)
 
 
 def test_overlay_colours_only_where_attention_is() -> None:

@@ -111,11 +111,6 @@ def test_targets_are_within_the_force_limit(ran: list[Config]) -> None:
         next(trials(load_config(None, ["control.force_limit_n=1"]), 1, workers=1))
 
 
-def test_trials_of_one_object_with_one_target_are_unseen_scenes(ran: list[Config]) -> None:
-    list(trials(load_config(None, []), 3, workers=1, objects=["tube"], target_n=2.5))
-    assert [(c.object, c.target_n, c.seed) for c in ran] == [("tube", 2.5, seed) for seed in range(3)]
-
-
 def test_several_processes_are_refused_with_a_real_device() -> None:
     with pytest.raises(ConfigError, match="only one process can open"):
         next(trials(load_config(None, REAL), 2, workers=2))
@@ -127,13 +122,6 @@ def test_after_a_fault_of_a_real_gripper_nothing_moves(ran: list[Config]) -> Non
     with pytest.raises(DeviceError, match="trial 2 of 3 ended with a fault"):
         next(running)
     assert len(ran) == 2
-
-
-def test_a_person_places_the_object_before_each_trial(ran: list[Config]) -> None:
-    asked: list[tuple[int, str]] = []
-    config = load_config(None, REAL)
-    list(trials(config, 2, workers=1, objects=["mug"], prompt=lambda text: asked.append((len(ran), text))))
-    assert asked == [(n, f"Put the mug between the jaws for trial {n + 1} of 2") for n in range(2)]
 
 
 def test_grasps_of_the_same_object_pass_on_what_was_learned(

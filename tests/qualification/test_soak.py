@@ -54,6 +54,14 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(soaking, "PAPER_OBJECTS", ("stapler",))
 
 
+def grasped(config: Config, seconds: int = 1) -> dict[str, Any]:
+    """Stands in for a grasp: writes a log of this length, without a gripper."""
+    with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
+        for t_s in (0, seconds):
+            log.write(Event(t_s * NS_PER_S, "session", "tick"))
+    return {"result": "held"}
+
+
 @pytest.mark.usefixtures("short")
 def test_stability_soak_finds_no_growth_in_a_few_grasps(quick_vision: list[str]) -> None:
     keys = [*quick_vision, "camera.rate_hz=20"]  # frames take most of the time
@@ -78,10 +86,7 @@ def test_interrupt_returns_the_results_so_far(grasps: int, monkeypatch: pytest.M
     def interrupted(config: Config) -> dict[str, Any]:
         if next(left, None) is None:
             raise KeyboardInterrupt
-        with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
-            log.write(Event(0, "session", "tick"))
-            log.write(Event(NS_PER_S, "session", "tick"))
-        return {"result": "held"}
+        return grasped(config)
 
     monkeypatch.setattr(soaking, "grasp", interrupted)
     if grasps < 2:  # too few to compare
@@ -95,13 +100,7 @@ def test_interrupt_returns_the_results_so_far(grasps: int, monkeypatch: pytest.M
 def test_growth_of_memory_is_found_in_the_shortest_test(monkeypatch: pytest.MonkeyPatch) -> None:
     memory_mb = itertools.count(300.0, 40.0)
 
-    def grow(config: Config) -> dict[str, Any]:
-        with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
-            log.write(Event(0, "session", "tick"))
-            log.write(Event(NS_PER_S, "session", "tick"))
-        return {"result": "held"}
-
-    monkeypatch.setattr(soaking, "grasp", grow)
+    monkeypatch.setattr(soaking, "grasp", grasped)
     monkeypatch.setattr(soaking, "_sample", lambda done_s: Sample(done_s, next(memory_mb), 9, 2))
     report = soak(Config(), 0)
     assert (report["ok"], report["growth_mb"]) == (False, 4 * 40.0)
@@ -116,10 +115,7 @@ def test_leaked_threads_and_files_are_found(monkeypatch: pytest.MonkeyPatch, tmp
         left.append((tmp_path / "left").open("wb"))
         left.append(threading.Thread(target=end.wait, daemon=True))
         left[-1].start()
-        with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
-            for t_s in range(3):
-                log.write(Event(t_s * NS_PER_S, "session", "tick"))
-        return {"result": "held"}
+        return grasped(config, seconds=2)
 
     monkeypatch.setattr(soaking, "grasp", leaky)
     try:

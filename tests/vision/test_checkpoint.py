@@ -146,7 +146,7 @@ def test_folder_is_refused(tmp_path: Path) -> None:
         load_checkpoint(tmp_path)
 
 
-def test_other_safetensors_files_are_refused(file: Path, tmp_path: Path) -> None:
+def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.safetensors"
     save_file({"x": torch.zeros(1)}, other)
     with pytest.raises(CheckpointError, match="not a gripper-force-network"):

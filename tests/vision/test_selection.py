@@ -148,17 +148,6 @@ def test_engine_of_another_package_is_measured_and_not_cached(
     assert not cache.exists()
 
 
-@pytest.mark.usefixtures("_stated_times")
-@pytest.mark.parametrize("text", ["", "[]", '{"a": {"b": 1}}'])
-def test_damaged_cache_is_measured_again(
-    cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch, text: str
-) -> None:
-    cache.parent.mkdir(parents=True)
-    cache.write_text(text, encoding="utf-8")
-    monkeypatch.setattr(selection, "installed", lambda: ["torch"])
-    assert candidates(VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto"))
-
-
 def test_precision_is_never_chosen_because_only_float32_has_the_score_of_unfamiliar_frames(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -36,12 +36,6 @@ def test_version_is_of_the_package_that_holds_the_engine(monkeypatch: pytest.Mon
     assert engine_version("other") == ""  # this entry point belongs to no distribution
 
 
-def test_key_names_file_engine_settings_and_machine(tiny_checkpoint: Path) -> None:
-    model = read_model(tiny_checkpoint)
-    key = cache_key(model, "torch", "float32", 2)
-    assert key.startswith(f"{model.digest[:16]} .safetensors torch {engine_version('torch')} float32 2 ")
-
-
 def test_exported_files_of_one_checkpoint_have_keys_of_their_own(
     tiny_checkpoint: Path, tmp_path: Path
 ) -> None:

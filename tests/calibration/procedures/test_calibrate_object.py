@@ -480,13 +480,6 @@ def test_options_of_recording_and_given_logs_exclude_each_other(
     assert str(refused) == f"{name} is for recording touches and --from records none; leave out one of them"
 
 
-def test_closed_terminal_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = by_hand(tmp_path, monkeypatch, Terminal(0, lambda: ""))
-    assert isinstance(result.exception, ConfigError)
-    assert "no answer to this: Put the object between the jaws for touch 1" in str(result.exception)
-    assert not list(tmp_path.rglob("*.mcap"))
-
-
 def test_unwritable_profile_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="can't write"):

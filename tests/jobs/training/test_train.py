@@ -1,6 +1,6 @@
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -139,15 +139,7 @@ def test_resumed_training_gives_the_same_result(
     whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
     train(config, clips, whole)
     monkeypatch.setattr(train_module, "STATE_EVERY_S", 0.0)
-    update = Trainer._update
-    steps = iter(range(100))
-
-    def failing(trainer: Trainer) -> torch.Tensor:
-        if next(steps) == 6:  # in the second member
-            raise KeyboardInterrupt
-        return update(trainer)
-
-    monkeypatch.setattr(Trainer, "_update", failing)
+    steps = interrupt_step(monkeypatch, 6)  # in the second member
     with pytest.raises(KeyboardInterrupt):
         train(config, clips, broken)
     assert not broken.exists()
@@ -188,8 +180,8 @@ def test_training_too_short_for_all_recordings_warns(
     assert warnings[2] == warnings[1]  # it also counts the steps before the interruption
 
 
-def interrupt_step(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    """Interrupts the training in one step, once."""
+def interrupt_step(monkeypatch: pytest.MonkeyPatch, step: int) -> Iterator[int]:
+    """Interrupts the training in one step, once. Returns the numbers of the steps to come."""
     update = Trainer._update
     steps = iter(range(1000))
 
@@ -199,6 +191,7 @@ def interrupt_step(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
         return update(trainer)
 
     monkeypatch.setattr(Trainer, "_update", interrupted)
+    return steps
 
 
 SMALL = ["preprocess.size=16", "width=0.25", "hidden=16", "head=24", "device=cpu"]

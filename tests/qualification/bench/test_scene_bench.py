@@ -60,6 +60,6 @@ def test_finer_levels_cost_more_and_have_less_error(monkeypatch: pytest.MonkeyPa
     assert kept["stapler"]["coarse"]["error_n"] == round(coarse.error_n, 3)
 
 
-def test_unknown_object_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_object_raises() -> None:
     with pytest.raises(ConfigError, match="no simulated object 'brick'"):
         list(scene_costs(["brick"], keep_table=False))

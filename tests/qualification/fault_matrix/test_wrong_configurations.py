@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 
 from gripper_force.cli import app
 from gripper_force.config import config_from, load_config
-from gripper_force.control.limits import Limits
 from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.qualification.fault_matrix import wrong_configurations
@@ -25,7 +24,6 @@ from gripper_force.qualification.fault_matrix.wrong_configurations import (
     run_wrong,
 )
 from gripper_force.schema import Tree
-from gripper_force.types import ServoCommand
 
 STAPLER = 3
 """Number of a grasp of the cheapest object."""
@@ -101,17 +99,6 @@ def test_a_missing_speed_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None
     found = outcome(leaving(2.4))
     assert found["speed_share"] > 1.5
     assert "times as fast as configured" in found["failure"]
-
-
-def test_a_current_beyond_its_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    apply = Limits.apply
-
-    def doubled(*arguments: Any, **options: Any) -> tuple[ServoCommand, bool]:
-        command, over = apply(*arguments, **options)
-        return replace(command, goal_current_a=2.5 * command.goal_current_a), over
-
-    monkeypatch.setattr(Limits, "apply", doubled)
-    assert "% over the limit" in outcome(row("torque constant", sim__gain=1.4))["failure"]
 
 
 def test_a_torque_constant_beyond_the_configured_bound_is_found() -> None:
