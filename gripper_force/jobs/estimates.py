@@ -8,7 +8,6 @@ import torch
 
 from gripper_force.jobs.dataset import Clip, check_size
 from gripper_force.profiles.correction import Correction
-from gripper_force.progress import Progress, no_progress
 from gripper_force.types import Gray
 from gripper_force.vision.batch_inference import predict, stream_features
 from gripper_force.vision.checkpoint import Checkpoint
@@ -16,15 +15,12 @@ from gripper_force.vision.engines import Precision
 from gripper_force.vision.engines.pytorch import restored_threads
 
 
-def estimate_clips(
-    checkpoint: Checkpoint, clips: Sequence[Clip], progress: Progress = no_progress
-) -> list[npt.NDArray[np.float32]]:
+def estimate_clips(checkpoint: Checkpoint, clips: Sequence[Clip]) -> list[npt.NDArray[np.float32]]:
     """Returns each member's estimate for each frame, from which any ensemble of members can be formed.
 
     Args:
         checkpoint: The networks, computed on a GPU if there is one.
         clips: Recordings, downscaled to the checkpoint's size.
-        progress: Called after each clip.
 
     Returns:
         Forces in N of each clip, (members, T).
@@ -36,10 +32,7 @@ def estimate_clips(
     preprocess = checkpoint.header.preprocess
     check_size(clips, preprocess)
     networks = [network.to(device) for network in checkpoint.networks]
-    forces_n = []
-    for clip in clips:
-        forces_n.append(predict(networks, preprocess, clip.frames, device))
-        progress(f"evaluated {clip.name}")
+    forces_n = [predict(networks, preprocess, clip.frames, device) for clip in clips]
     for network in networks:
         network.cpu()
     return forces_n

@@ -16,6 +16,9 @@ MAX_SPAN_S: Final = 7200.0
 MAX_LAG_S: Final = 1.0
 """Largest lag that `lag_s` believes. Estimates are 0.05 to 0.3 s late, and a force that hardly changes shows no lag."""
 
+_STEP_S: Final = 0.001
+"""Resolution of `lag_s`: both signals are interpolated to it over the span they share."""
+
 
 @dataclass(frozen=True, slots=True)
 class ForceBin:
@@ -69,17 +72,17 @@ def bias(predicted: Signal, measured: Signal) -> float:
     return float(_error(predicted, measured).mean())
 
 
-def per_bin(predicted_n: Signal, measured_n: Signal, width_n: float = 1.0) -> list[ForceBin]:
-    """Errors by measured force, in bins of ``width_n``, by rising force and without empty bins."""
+def per_bin(predicted_n: Signal, measured_n: Signal) -> list[ForceBin]:
+    """Errors by measured force, in bins of 1 N, by rising force and without empty bins."""
     error = _error(predicted_n, measured_n)
-    index = np.floor(np.asarray(measured_n, np.float64) / width_n)
+    index = np.floor(np.asarray(measured_n, np.float64))
     bins = []
     for i in np.unique(index):
         part = error[index == i]
         bins.append(
             ForceBin(
-                from_n=float(i * width_n),
-                to_n=float((i + 1) * width_n),
+                from_n=float(i),
+                to_n=float(i + 1),
                 frames=len(part),
                 mae_n=float(np.abs(part).mean()),
                 bias_n=float(part.mean()),
@@ -88,17 +91,14 @@ def per_bin(predicted_n: Signal, measured_n: Signal, width_n: float = 1.0) -> li
     return bins
 
 
-def lag_s(
-    t_s: Signal, values: Signal, reference_t_s: Signal, reference: Signal, *, step_s: float = 0.001
-) -> float:
-    """Lag of a signal behind a reference: the peak of their cross-correlation.
+def lag_s(t_s: Signal, values: Signal, reference_t_s: Signal, reference: Signal) -> float:
+    """Lag of a signal behind a reference: the peak of their cross-correlation, at steps of `_STEP_S`.
 
     Args:
         t_s: Sample times of the signal, rising, (N,).
         values: The signal, (N,).
         reference_t_s: Sample times of the reference, rising, (M,).
         reference: The reference, (M,).
-        step_s: Resolution. Both signals are interpolated to it over the span they share.
 
     Returns:
         Lag in s, positive if the signal is later. NaN if either is constant, if the lag is longer than `MAX_LAG_S`,
@@ -106,9 +106,9 @@ def lag_s(
     """
     t, t_ref = np.asarray(t_s, np.float64), np.asarray(reference_t_s, np.float64)
     begin, end = max(t[0], t_ref[0]), min(t[-1], t_ref[-1])
-    if not 2 * step_s <= end - begin <= MAX_SPAN_S:
+    if not 2 * _STEP_S <= end - begin <= MAX_SPAN_S:
         return float("nan")
-    grid = np.arange(begin, end, step_s)
+    grid = np.arange(begin, end, _STEP_S)
     a = np.interp(grid, t, np.asarray(values, np.float64))
     b = np.interp(grid, t_ref, np.asarray(reference, np.float64))
     if np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -116,7 +116,7 @@ def lag_s(
     size = 1 << (2 * len(grid)).bit_length()  # zero padding for both, against circular wrap-around
     spectrum = np.fft.rfft(a - a.mean(), size) * np.fft.rfft(b - b.mean(), size).conj()
     shift = int(np.fft.irfft(spectrum, size).argmax())
-    found_s = (shift if shift < size // 2 else shift - size) * step_s
+    found_s = (shift if shift < size // 2 else shift - size) * _STEP_S
     return found_s if abs(found_s) <= MAX_LAG_S else float("nan")
 
 

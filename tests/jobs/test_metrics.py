@@ -19,8 +19,6 @@ def test_bins_use_measured_force() -> None:
     assert [(b.from_n, b.to_n, b.frames) for b in bins] == [(0, 1, 1), (2, 3, 1), (4, 5, 2)]
     assert bins[2].mae_n == pytest.approx((0.5 + 4.1) / 2)
     assert bins[2].bias_n == pytest.approx((-0.5 + 4.1) / 2)
-    (wide,) = metrics.per_bin(PREDICTED, MEASURED, width_n=5.0)
-    assert wide.frames == 4
 
 
 @pytest.mark.filterwarnings("error")

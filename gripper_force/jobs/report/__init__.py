@@ -25,7 +25,6 @@ class ReportPaths:
 
 def write_report(
     log: Path,
-    out_dir: Path | None = None,
     *,
     recover: bool = False,
     checkpoint: str | None = None,
@@ -37,9 +36,8 @@ def write_report(
     estimates and decisions of an open-loop replay.
 
     Args:
-        log: The log.
-        out_dir: Folder for ``<log>.png`` and ``<log>.html``, with ``-replayed`` after the name if there are
-            changes; by default the log's folder.
+        log: The log. Beside it are ``<log>.png`` and ``<log>.html``, with ``-replayed`` after the name if there are
+            changes.
         recover: Read the intact part of a truncated or damaged log.
         checkpoint: Another network to estimate with; None: the log's own.
         overrides: Changes of the log's configuration, as for `gripper_force.jobs.replay.replay`.
@@ -49,7 +47,6 @@ def write_report(
         ConfigError: The log holds a configuration that this version does not understand, or a change is wrong.
         CheckpointError: The other network's file can't be read.
     """
-    folder = out_dir or log.parent
     reader = LogReader(log, recover=recover)
     if checkpoint is None and not overrides:
         stem = log.stem
@@ -60,16 +57,15 @@ def write_report(
         again = resolve_replay(changed_config(reader, checkpoint, overrides))
         sampler = FrameSampler(reader, again.config)
         run = read_run(reader, sampler.add, run_again(reader, again), again.config)
-    paths = ReportPaths(folder / f"{stem}.png", folder / f"{stem}.html")
+    paths = ReportPaths(log.with_name(f"{stem}.png"), log.with_name(f"{stem}.html"))
     pictures, note = sampler.pictures(run)
     figure = draw(run, pictures)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         figure.savefig(paths.png)
         figure.set_layout_engine("none")  # the page shows the same figure, whose parts have their places now
         paths.html.write_text(render(run, to_svg(figure), note), encoding="utf-8")
     except OSError as error:
         raise LogError(
-            f"can't write the report {error.filename or folder}: {error.strerror}; check the folder"
+            f"can't write the report {error.filename or log.parent}: {error.strerror}; check the folder"
         ) from error
     return paths

@@ -97,12 +97,6 @@ class RowSummary(TypedDict):
         lost_records: Most records that a log lacks.
         lost_ms: Longest time before the signal that a log lacks.
         failures: Deviation by seed and clock, for grasps with an unexpected reaction.
-        live_runs: As above, in real time.
-        live_ok: As above, in real time.
-        live_median_ms: As above, in real time.
-        live_worst_ms: As above, in real time.
-        live_peak_over_limit: As above, in real time.
-        live_results: As above, in real time.
     """
 
     row: str

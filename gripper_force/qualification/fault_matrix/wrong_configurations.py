@@ -185,12 +185,7 @@ class WrongSummary(TypedDict):
         speed_share: Largest speed of a jaw without contact over the configured one.
         held_nothing: Number of grasps that counted as held without contact force.
         failures: What is wrong by the keys of the grasp, for grasps that are not as expected.
-        live_runs: As above, in real time.
-        live_ok: As above, in real time.
-        live_results: As above, in real time.
-        live_force_share: As above, in real time; None without a grasp.
-        live_speed_share: As above, in real time; None without a grasp.
-        live_held_nothing: As above, in real time.
+        live_force_share, live_speed_share: None without a grasp in real time.
     """
 
     row: str

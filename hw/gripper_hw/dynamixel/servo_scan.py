@@ -39,24 +39,19 @@ def ports() -> list[str]:
     return sorted(stable.get(port.device, port.device) for port in list_ports.comports())
 
 
-def scan(
-    config: Config,
-    names: Iterable[str],
-    baud_rates: Iterable[int] = BAUD_RATES,
-    progress: Progress = no_progress,
-) -> list[PortScan]:
+def scan(config: Config, names: Iterable[str], progress: Progress = no_progress) -> list[PortScan]:
     """Returns the servos that answer on each port, or why the port can't be used.
 
     Args:
         config: The configuration; its model tells servos of a file of one's own.
         names: Ports to search.
-        baud_rates: Baud rates to try, in this order.
         progress: Called with each port and baud rate.
     """
-    return [_scan_port(config, name, tuple(baud_rates), progress) for name in names]
+    return [_scan_port(config, name, progress) for name in names]
 
 
-def _scan_port(config: Config, name: str, baud_rates: tuple[int, ...], progress: Progress) -> PortScan:
+def _scan_port(config: Config, name: str, progress: Progress) -> PortScan:
+    baud_rates = tuple(BAUD_RATES)
     found: dict[int, FoundServo] = {}
     problems: list[str] = []
     with ExitStack() as stack:
