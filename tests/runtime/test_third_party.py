@@ -132,9 +132,8 @@ def test_a_device_that_can_not_be_opened_is_named(
 @pytest.mark.parametrize("unit", ["camera", "load_cell", "servo"])
 @pytest.mark.parametrize("error", [None, ZeroDivisionError()])
 def test_a_device_that_can_not_be_closed_hides_neither_result_nor_error(
-    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unit: str, error: Exception | None
+    config: Config, tmp_path: Path, unit: str, error: Exception | None
 ) -> None:
-    monkeypatch.setattr(import_module("own_devices").Servo, "stopped", stopped := list[bool]())
     named = rf"{unit}\.backend={UNITS[unit]}: {UNITS[unit].partition(':')[2]}\.close\(\) raised ValueError: no close here"
 
     def run() -> None:
@@ -150,7 +149,7 @@ def test_a_device_that_can_not_be_closed_hides_neither_result_nor_error(
     ):
         run()
     assert virtual.find_bus("rig") is None  # closed after the device
-    assert stopped == ([False] if unit == "servo" else [])
+    assert import_module("own_devices").Servo.stopped == ([False] if unit == "servo" else [])
     assert LogReader(tmp_path / "run.mcap").complete
 
 
@@ -302,7 +301,6 @@ def test_a_servo_whose_start_returns_nothing_is_told_to_stop(
 ) -> None:
     own = with_own(config, "servo", "nothing")
     servo = import_module("own_devices").Servo
-    monkeypatch.setattr(servo, "stopped", [])
     monkeypatch.setattr(servo, "start", lambda self: None)
     with pytest.raises(
         DeviceError,
@@ -398,7 +396,6 @@ def test_a_record_with_a_wrong_field_ends_the_run_at_once(
             result, {**names, "Frame": Frame, "LoadCellSample": LoadCellSample, "ServoState": ServoState}
         )
 
-    monkeypatch.setattr(module.Servo, "stopped", [])
     monkeypatch.setattr(getattr(module, UNITS[unit].partition(":")[2]), method, wrong)
     name = UNITS[unit]
     with pytest.raises(
@@ -416,7 +413,6 @@ def test_a_servo_whose_time_stands_still_ends_the_run(
     own = with_own(config, "servo", "")
     servo = import_module("own_devices").Servo
     state = ServoState(time.monotonic_ns(), 0.0, 0.0, 0.0, 30.0, 12.0, 0)
-    monkeypatch.setattr(servo, "stopped", [])
     monkeypatch.setattr(servo, "read", lambda self: state)
     with pytest.raises(DeviceTimeoutError, match=r"^the servo's t_ns stands still; "):
         run_grasp(own, tmp_path / "run.mcap")
