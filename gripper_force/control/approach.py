@@ -106,8 +106,8 @@ class Approach:
         self._has_moved = self._at_limit = self._is_weak = False
 
     @property
-    def _limit_n(self) -> float:
-        """Largest contact force before contact is detected."""
+    def _max_contact_n(self) -> float:
+        """Largest force on an object whose contact is not detected yet."""
         return min(self._config.approach_force_n, _CONTACT_SHARE * self._target_n)
 
     def moves_freely(self, closing_m_s: float, measured_n: float) -> bool:
@@ -119,8 +119,8 @@ class Approach:
         """
         if self.is_backing_off or self._time_s < ACCELERATION_S + _STEADY_S:
             return False
-        steady_speed = abs(closing_m_s - self.speed_m_s) < _STEADY_SHARE * self.speed_m_s
-        return steady_speed and self._mean_force_n - self.motor_force_n < _STEADY_FORCE_N
+        has_steady_speed = abs(closing_m_s - self.speed_m_s) < _STEADY_SHARE * self.speed_m_s
+        return has_steady_speed and self._mean_force_n - self.motor_force_n < _STEADY_FORCE_N
 
     def step(
         self,
@@ -143,7 +143,7 @@ class Approach:
         """
         self._time_s += dt_s
         if self.is_backing_off:
-            return self._step_back(width_m)
+            return self._step_back_off(width_m)
         self._mean_force_n += (measured_n - self._mean_force_n) * dt_s / (dt_s + _STEADY_FILTER_S)
         self._drive(dt_s, closing_m_s, estimate, max_n)
         self._has_moved |= closing_m_s > _SLOWED_SHARE * self.speed_m_s
@@ -156,9 +156,9 @@ class Approach:
             return ApproachState.CONTACT
         # Too little motor force lets the jaws creep. So they open, which shows friction.
         share = _SLOWED_SHARE if self._is_weak else _STALLED_SHARE
-        stands = self._at_limit and closing_m_s < share * self.speed_m_s
+        stands_still = self._at_limit and closing_m_s < share * self.speed_m_s
         may_be_stuck = not has_travelled or self._is_weak
-        self._stuck_s = self._stuck_s + dt_s if stands and may_be_stuck else 0.0
+        self._stuck_s = self._stuck_s + dt_s if stands_still and may_be_stuck else 0.0
         if self._stuck_s < _STUCK_S:
             return ApproachState.CLOSING
         if self._has_backed_off:
@@ -167,7 +167,7 @@ class Approach:
         self._begin(width_m)
         return ApproachState.BACKING_OFF
 
-    def _step_back(self, width_m: float) -> ApproachState:
+    def _step_back_off(self, width_m: float) -> ApproachState:
         self.motor_force_n = self._config.approach_force_n + self._transmission.friction_n
         opened_m = width_m - self._start_m
         is_late = self._time_s > _BACK_OFF_SPARE_S + 0.5 * _BACK_OFF_M / self.speed_m_s
@@ -194,7 +194,7 @@ class Approach:
         )
         # Force that the current estimate counts as contact and vision does not is friction, too.
         friction_n = estimate.friction_n - estimate.bias_n + 2 * estimate.std_n
-        usual_max_n = friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0)
+        usual_max_n = friction_n + self._max_contact_n + damping_n_s_m * max(closing_m_s, 0.0)
         self._is_weak = max_n < usual_max_n
         max_n = min(usual_max_n, max_n)
         self._integral_n += SPEED_INTEGRAL_N_M * error_m_s * dt_s
@@ -205,8 +205,8 @@ class Approach:
         self._at_limit = self.motor_force_n > (0.9 if self._is_weak else 0.99) * max_n
 
     def _detects_contact(self, closing_m_s: float, estimate: FusedForce) -> bool:
-        pressing = estimate.current_n + estimate.bias_n > 0.5 * self._limit_n
-        stalled = closing_m_s < _STALLED_SHARE * self.speed_m_s
-        slowed = self._has_moved and closing_m_s < _SLOWED_SHARE * self.speed_m_s
-        visual = estimate.source != EstimateSource.CURRENT and estimate.force_n > _VISUAL_CONTACT_N
-        return (stalled and pressing) or (slowed and visual)
+        is_pressing = estimate.current_n + estimate.bias_n > 0.5 * self._max_contact_n
+        is_stalled = closing_m_s < _STALLED_SHARE * self.speed_m_s
+        is_slowed = self._has_moved and closing_m_s < _SLOWED_SHARE * self.speed_m_s
+        is_seen = estimate.source != EstimateSource.CURRENT and estimate.force_n > _VISUAL_CONTACT_N
+        return (is_stalled and is_pressing) or (is_slowed and is_seen)

@@ -57,7 +57,7 @@ class CurrentEstimate:
         self.free_travel = FreeTravel()
 
     def take_friction(self, friction_n: float) -> None:
-        """Takes over friction that an opening of this grasp has shown."""
+        """Uses the friction that an opening of this grasp has shown."""
         self.friction_n, self.friction_variance_n2 = max(friction_n, 0.0), FREE_FLOOR_N**2
 
     def step(self, servo: ServoState, *, free: bool, holding: bool, lowering: bool) -> None:
@@ -69,7 +69,7 @@ class CurrentEstimate:
             holding: True while the force is to stay at the target, if it was not lowered to it.
             lowering: True while the force falls to a lower target.
         """
-        before_n = self.force_n
+        previous_n = self.force_n
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
         damping_n = self._transmission.damping_n_s_m * closing_m_s
         motor_force_n = self._transmission.force_n(servo.current_a, servo.position_rad) - damping_n
@@ -85,7 +85,7 @@ class CurrentEstimate:
             self._learn_friction()
         # Coulomb friction acts as play: the contact force stays until the motor force differs by friction.
         low_n, high_n = self._motor_force_n - self.friction_n, self._motor_force_n + self.friction_n
-        self.force_n = min(max(before_n, low_n), high_n)
+        self.force_n = min(max(previous_n, low_n), high_n)
         if holding and closing_m_s > self._slides_m_s:  # friction acts in full against the motion
             self.force_n = low_n
         if free:

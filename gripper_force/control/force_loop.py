@@ -11,7 +11,7 @@ _RAMP_ACCELERATION_S = 0.4
 """Acceleration time of the ramp: longer than a quarter oscillation period of the softest object."""
 
 _MAX_RAMP_PER_S = 10.0
-"""Fastest ramp as a share of the force limit per second. Jaws that a faster one accelerates exceed the limit."""
+"""Fastest ramp as a share of the force limit per second. With a faster one, moving jaws exceed the force limit."""
 
 _LOWERING_S = 0.15
 _RETURN_S = 0.05

@@ -68,9 +68,9 @@ class FrictionAllowance:
         self._has_moved |= not is_slow
 
     def learn(self, friction_n: float | None, *, only_lower: bool) -> None:
-        """Takes over what a motion shows, None for nothing.
+        """Takes the friction that a motion shows; None if it shows none.
 
-        With ``only_lower`` it does not show that friction has risen: jaws that close may press on a soft object.
+        With ``only_lower`` friction may only fall: closing jaws may press on a soft object, which looks like friction.
         """
         if friction_n is not None:
             self.was_shown_in_grasp = True

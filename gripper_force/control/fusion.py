@@ -48,8 +48,8 @@ NO_NEW_ESTIMATE: Final = "no new estimate"
 
 def drop_out_reason(text: str) -> str | None:
     """Returns the reason in the text of an event that says that vision dropped out; None for other events."""
-    found = re.fullmatch("vision (?:dropped out|is not used): (.*); using motor current alone", text)
-    return None if found is None else found[1]
+    match = re.fullmatch("vision (?:dropped out|is not used): (.*); using motor current alone", text)
+    return None if match is None else match[1]
 
 
 def observer_lag_s(frame_hz: float) -> float:
@@ -86,13 +86,13 @@ class Fusion:
         self._timeout_ns = round(config.vision_gap_ms * NS_PER_MS)
         self._max_age_ns = round(config.max_frame_age_ms * NS_PER_MS)
         self._std_limit_n = config.vision_std_n
-        self._reentry = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
+        self._reentry_count = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
         self._transmission = transmission
         self._object_gain = ObjectGain(transmission.torque_constant_std, config.object_ratio)
         self._learns_gain = config.learn_gain
         self.current = CurrentEstimate(config, transmission)
         self._newest_visual_ns = -1
-        self._used_ns: int | None = None
+        self._last_used_ns: int | None = None
         self._visual_n = 0.0
         self._visual_std_n = 0.0
         self._source = EstimateSource.CURRENT
@@ -131,7 +131,7 @@ class Fusion:
         At contact the friction force can be anywhere within +- Coulomb friction.
         """
         self._variance_n2 = self._prior_n2(self.current.force_n)
-        self._rejected = 0
+        self._rejection_count = 0
 
     def step(
         self,
@@ -178,7 +178,7 @@ class Fusion:
                 self._newest_visual_ns = visual.t_ns
             self._rejection = self._update(t_ns, visual)
             if not self._rejection:
-                self._used_ns = t_ns
+                self._last_used_ns = t_ns
         events = self._switch_source(t_ns)
         if self._gain_event:
             events = (*events, Event(t_ns, "vision", self._gain_event))
@@ -201,25 +201,25 @@ class Fusion:
             self._temporary_n2 += (self._difference_n / (1 + self._variance_ratio)) ** 2
 
     def _predict(self, servo: ServoState, free: bool) -> None:
-        before_n = self.current.force_n
+        previous_n = self.current.force_n
         self.current.step(servo, free=free, holding=self._holds, lowering=self._was_lowering)
         current_n = self.current.force_n
         if free:
             self._difference_n = 0.0
-        if self._was_lowering and before_n > 0:  # the difference by the gearing falls with the force
-            gearing_n2 = (self._transmission.torque_constant_std * before_n) ** 2
+        if self._was_lowering and previous_n > 0:  # the difference by the gearing falls with the force
+            gearing_n2 = (self._transmission.torque_constant_std * previous_n) ** 2
             share = gearing_n2 / (gearing_n2 + self.current.friction_variance_n2 + FREE_FLOOR_N**2)
-            self._difference_n *= 1 - share * (1 - current_n / before_n)
+            self._difference_n *= 1 - share * (1 - current_n / previous_n)
         drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * self.current.reversal) * self.current.dt_s
         # An error g of the torque constant gives a bias of g * force: its variance grows with the square of the force.
-        gearing_n2 = self._transmission.torque_constant_std**2 * abs(current_n**2 - before_n**2)
+        gearing_n2 = self._transmission.torque_constant_std**2 * abs(current_n**2 - previous_n**2)
         self._variance_n2 = min(self._variance_n2 + drift_n2 + gearing_n2, self._prior_n2(current_n))
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Updates the filter with one estimate. Returns the reason of a rejection, or an empty text."""
         age_ns = t_ns - visual.t_ns
         if not (abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9):
-            self._used_ns = None  # the earlier estimates of such a network are not trusted either
+            self._last_used_ns = None  # the earlier estimates of such a network are not trusted either
             return "it is not finite"
         if not 0 <= age_ns <= self._max_age_ns:
             return "its time is in the future" if age_ns < 0 else f"it is {age_ns / NS_PER_MS:.0f} ms old"
@@ -229,10 +229,10 @@ class Fusion:
             return problem
         current_n = self.current.at(visual.t_ns)
         if self._holds and self._learns_gain:
-            seen_n2 = max(visual.std_n**2 - (KIND_STD * visual.force_n) ** 2, _VISION_FLOOR_N**2)
+            visual_n2 = max(visual.std_n**2 - (KIND_STD * visual.force_n) ** 2, _VISION_FLOOR_N**2)
             play_n = _PLAY_SHARE * self.current.friction_n * self.current.reversal
-            unknown_n2 = self.current.friction_variance_n2 + FREE_FLOOR_N**2 + play_n**2
-            self._object_gain.observe(current_n, visual.force_n, unknown_n2 + seen_n2)
+            current_n2 = self.current.friction_variance_n2 + FREE_FLOOR_N**2 + play_n**2
+            self._object_gain.observe(current_n, visual.force_n, current_n2 + visual_n2)
         if (object_gain := self._applied_gain) is not None:
             force_n, std_n = object_gain.corrected(visual.force_n, visual.std_n)
             visual = replace(visual, force_n=force_n, std_n=std_n)
@@ -247,11 +247,11 @@ class Fusion:
             self._is_contradicted = True
             return f"it differs from the motor current by {difference_n:.2f} N"
         if abs(innovation_n) > GATE * math.sqrt(self._variance_n2 + claimed_n2):
-            self._rejected = _count_rejections(self._rejected, innovation_n)
-            if abs(self._rejected) < self._reentry:
+            self._rejection_count = _count_rejections(self._rejection_count, innovation_n)
+            if abs(self._rejection_count) < self._reentry_count:
                 return f"it jumps by {innovation_n:.2f} N"
             self._variance_n2 = self._prior_n2(current_n)
-        self._rejected, self._is_contradicted = 0, False
+        self._rejection_count, self._is_contradicted = 0, False
         self._correct(innovation_n, _FRAME_NOISE_N**2)
         # Errors that vision and motor current share do not make either of them better than the other.
         prior_n2 = self._prior_n2(current_n)
@@ -269,8 +269,8 @@ class Fusion:
         return self.current.variance_n2(force_n) + self._opening_variance_n2
 
     def _switch_source(self, t_ns: int) -> tuple[Event, ...]:
-        fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
-        source = EstimateSource(self._feedback) if fresh else EstimateSource.CURRENT
+        is_recent = self._last_used_ns is not None and t_ns - self._last_used_ns <= self._timeout_ns
+        source = EstimateSource(self._feedback) if is_recent else EstimateSource.CURRENT
         change = "dropped out"
         if source == self._source:
             if not (self._nothing_reported and self._rejection):
@@ -308,7 +308,7 @@ class Fusion:
         )
 
 
-def _count_rejections(rejected: int, innovation_n: float) -> int:
+def _count_rejections(count: int, innovation_n: float) -> int:
     """Counts consecutive rejections on one side (the sign); the other side starts a new count."""
     side = 1 if innovation_n > 0 else -1
-    return rejected + side if rejected * side > 0 else side
+    return count + side if count * side > 0 else side

@@ -57,7 +57,7 @@ class Limits:
         self._unrounded_a = 0.0
         self._rounding_a = 0.0
         self._last_a = 0.0
-        self._over = False
+        self._was_over = False
 
     def apply(
         self,
@@ -95,22 +95,22 @@ class Limits:
         ceiling_a = min(self.ceiling_a(friction_n, present_rad), self._over_force_ceiling_a)
         if not may_rise or motor_force_n > _OVER_FORCE_MOTOR_SHARE * self._over_force_motor_n:
             ceiling_a = min(ceiling_a, self._last_a)
-        over = force_n > self._force_limit_n
-        if over and not opening:
-            if not self._over:
+        is_over = force_n > self._force_limit_n
+        if is_over and not opening:
+            if not self._was_over:
                 self._over_force_ceiling_a = _OVER_FORCE_CEILING * self._last_a
                 self._over_force_motor_n = motor_force_n
             # Friction may keep the force up. A motor force too small to reach the limit need not fall.
-            lowers = motor_force_n > self._force_limit_n - friction_n
-            ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if lowers else 1.0) * self._last_a)
-        self._over = over
+            must_fall = motor_force_n > self._force_limit_n - friction_n
+            ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if must_fall else 1.0) * self._last_a)
+        self._was_over = is_over
         rise_a_s = abs(self._transmission.current_a(self._rise_n_s, present_rad))
         rise_a_s /= _RISE_FACTOR if rises_slowly or self._over_force_ceiling_a < math.inf else 1.0
         wanted_a = min(max(command.goal_current_a, 0.0), self._unrounded_a + rise_a_s * dt_s, ceiling_a)
         self._unrounded_a = wanted_a
         self._last_a = self._quantise(wanted_a, ceiling_a)
         position_rad = min(max(command.goal_position_rad, self._low_rad), self._high_rad)
-        return ServoCommand(command.t_ns, position_rad, self._last_a), over
+        return ServoCommand(command.t_ns, position_rad, self._last_a), is_over
 
     def reset(self, *, reverses: bool = False) -> None:
         """Removes the ceiling that an over-force set. Called at the start and the end of a grasp.
@@ -139,11 +139,11 @@ class Limits:
             return wanted_a
         steps = round((wanted_a + self._rounding_a) / self._step_a)
         steps = min(steps, math.floor(ceiling_a / self._step_a + 1e-9))
-        given_a = min(steps * self._step_a, ceiling_a)
+        rounded_a = min(steps * self._step_a, ceiling_a)
         # Limited, so that no error accumulates while a limit holds the current down, and no current is negative.
-        error_a = self._rounding_a + wanted_a - given_a
+        error_a = self._rounding_a + wanted_a - rounded_a
         self._rounding_a = min(max(error_a, -0.5 * self._step_a), 0.5 * self._step_a)
-        return given_a
+        return rounded_a
 
     @staticmethod
     def _refuse_non_finite(

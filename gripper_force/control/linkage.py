@@ -229,12 +229,12 @@ def _table(config: LinkageConfig, open_width_m: float) -> Callable[[float], floa
         )
     curve = PchipInterpolator(angles_rad, widths_m)
     slope = curve.derivative()
-    first, last = float(slope(0.0)), float(slope(angles_rad[-1]))
+    first_slope, last_slope = float(slope(0.0)), float(slope(angles_rad[-1]))
 
     def closed_m(closing_rad: float) -> float:
         if closing_rad > angles_rad[-1]:
-            return open_width_m - (widths_m[-1] + last * (closing_rad - angles_rad[-1]))
-        return open_width_m - float(curve(closing_rad)) if closing_rad > 0 else -first * closing_rad
+            return open_width_m - (widths_m[-1] + last_slope * (closing_rad - angles_rad[-1]))
+        return open_width_m - float(curve(closing_rad)) if closing_rad > 0 else -first_slope * closing_rad
 
     return closed_m
 

@@ -59,15 +59,15 @@ class ObjectGain:
 
     Args:
         torque_constant_std: Relative standard deviation of the torque constant.
-        known: Ratio of earlier grasps, and its relative standard deviation without that of the torque constant;
+        earlier_ratio: Ratio of earlier grasps, and its relative standard deviation without that of the torque constant;
             None without any.
     """
 
-    def __init__(self, torque_constant_std: float, known: tuple[float, float] | None = None) -> None:
+    def __init__(self, torque_constant_std: float, earlier_ratio: tuple[float, float] | None = None) -> None:
         self._torque_variance = torque_constant_std**2
         self.reset()
-        if known is not None:
-            self.add(*known)
+        if earlier_ratio is not None:
+            self.add(*earlier_ratio)
 
     def reset(self) -> None:
         """Forgets everything: the next grasp is of another object."""
@@ -97,25 +97,25 @@ class ObjectGain:
         Args:
             counts: False if the grasp does not count, because no object was held to its end.
         """
-        measured = self._measured_log_ratio() if counts else None
+        present = self._measured_log_ratio() if counts else None
         self._start_grasp()
-        if measured is None:
+        if present is None:
             return ""
-        log_ratio, variance = measured
+        log_ratio, variance = present
         text = ""
         if self._weight:
-            before = self._weighted_log / self._weight
-            if abs(log_ratio - before) > GATE * math.sqrt(variance + 1 / self._weight):
+            earlier_log = self._weighted_log / self._weight
+            if abs(log_ratio - earlier_log) > GATE * math.sqrt(variance + 1 / self._weight):
                 text = (
                     f"vision and motor current differ by a factor of {math.exp(log_ratio):.2f}, in the grasps before "
-                    f"by {math.exp(before):.2f}: another object, whose gain is learned anew"
+                    f"by {math.exp(earlier_log):.2f}: another object, whose gain is learned anew"
                 )
                 self.reset()
         self._add(log_ratio, variance)
         return text
 
     def add(self, ratio: float, std: float) -> None:
-        """Adds the ratio of earlier grasps, with its relative standard deviation as for ``known``."""
+        """Adds the ratio of earlier grasps, with its relative standard deviation as for ``earlier_ratio``."""
         self._add(math.log(ratio), std**2)
 
     def _add(self, log_ratio: float, variance: float) -> None:
@@ -132,7 +132,7 @@ class ObjectGain:
 
     @property
     def ratio(self) -> tuple[float, float] | None:
-        """Ratio of the finished grasps and its relative standard deviation, as for ``known``; None without any."""
+        """Ratio of the finished grasps and its relative standard deviation, as for ``earlier_ratio``; None if none."""
         if not self._weight:
             return None
         return math.exp(self._weighted_log / self._weight), 1 / math.sqrt(self._weight)
@@ -144,9 +144,9 @@ class ObjectGain:
             with_present: Adds the present grasp.
         """
         weight, weighted_log = self._weight, self._weighted_log
-        if with_present and (measured := self._measured_log_ratio()) is not None:
-            weight += 1 / measured[1]
-            weighted_log += measured[0] / measured[1]
+        if with_present and (present := self._measured_log_ratio()) is not None:
+            weight += 1 / present[1]
+            weighted_log += present[0] / present[1]
         if not weight:
             return None
         log_ratio, variance = weighted_log / weight, self._torque_variance + 1 / weight
@@ -155,10 +155,10 @@ class ObjectGain:
             total = prior + variance
             density = share * math.exp(-0.5 * min(log_ratio**2 / total, 1400.0)) / math.sqrt(total)
             parts.append((density, prior / total * log_ratio, prior * variance / total, prior / total))
-        whole = sum(density for density, *_ in parts)
-        mean = sum(density / whole * centre for density, centre, _, _ in parts)
-        spread = sum(density / whole * (own + (centre - mean) ** 2) for density, centre, own, _ in parts)
-        shared = self._torque_variance * sum(density / whole * weight for density, _, _, weight in parts)
+        norm = sum(density for density, *_ in parts)
+        mean = sum(density / norm * centre for density, centre, _, _ in parts)
+        spread = sum(density / norm * (own + (centre - mean) ** 2) for density, centre, own, _ in parts)
+        shared = self._torque_variance * sum(density / norm * weight for density, _, _, weight in parts)
         return GainEstimate(math.exp(mean), math.sqrt(spread), math.sqrt(min(shared, spread)))
 
     @property

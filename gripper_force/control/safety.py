@@ -104,9 +104,9 @@ class SafetyLatch:
         return ""
 
     @staticmethod
-    def _jumps(before: ServoState, now: ServoState) -> bool:
-        time_s = max(now.t_ns - before.t_ns, 0) / NS_PER_S
-        return abs(now.position_rad - before.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
+    def _jumps(previous: ServoState, present: ServoState) -> bool:
+        time_s = max(present.t_ns - previous.t_ns, 0) / NS_PER_S
+        return abs(present.position_rad - previous.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
 
 
 def exceeds_goal_current(current_a: float, goal_current_a: float) -> bool:

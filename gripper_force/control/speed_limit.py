@@ -7,7 +7,7 @@ from gripper_force.config import ControlConfig
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import ServoCommand, ServoState
 
-_SPARE = 1.3
+_LEAD_FACTOR = 1.3
 """Lead as a multiple of what the wanted speed, or the goal current, needs. The largest steady speed is this multiple of
 the wanted one."""
 
@@ -20,7 +20,7 @@ _HOLD_SHARE = 0.5
 _OVERSPEED = 1.4
 """Multiple of the wanted speed above which the servo brakes."""
 
-_RESISTED = 2.0
+_RESISTED_FACTOR = 2.0
 """Multiple of the measured current up to which the lead follows the goal current. Jaws that are blocked come to their
 goal current even if the servo draws only half of what its data say, or if one of two fingers is blocked alone."""
 
@@ -60,10 +60,10 @@ class SpeedLimit:
         """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``."""
         distance_rad = command.goal_position_rad - servo.position_rad
         moving_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
-        ahead = distance_rad * servo.velocity_rad_s > 0
-        if ahead and abs(moving_m_s) > _OVERSPEED * speed_m_s:
+        nears_goal = distance_rad * servo.velocity_rad_s > 0
+        if nears_goal and abs(moving_m_s) > _OVERSPEED * speed_m_s:
             return replace(command, goal_position_rad=servo.position_rad)
-        resisted_a = _RESISTED * math.copysign(servo.current_a, servo.current_a * distance_rad)
+        resisted_a = _RESISTED_FACTOR * math.copysign(servo.current_a, servo.current_a * distance_rad)
         lead_rad = self._lead_rad(min(command.goal_current_a, resisted_a), servo.position_rad, speed_m_s)
         bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
         return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
@@ -72,7 +72,7 @@ class SpeedLimit:
         """Returns the distance from a goal width at which the servo's position loop may stop short of this current."""
         if self._loop is None:
             return 0.0
-        error_rad = _SPARE * abs(current_a) / self._loop.a_per_rad
+        error_rad = _LEAD_FACTOR * abs(current_a) / self._loop.a_per_rad
         return 2 * error_rad * self._transmission.jaw_m_per_rad(position_rad)
 
     def _lead_rad(self, rest_a: float, position_rad: float, speed_m_s: float) -> float:
@@ -80,4 +80,4 @@ class SpeedLimit:
         if self._loop is None:
             return _UNKNOWN_LEAD_M * rad_per_m
         moving_rad = speed_m_s * rad_per_m / self._loop.gain_per_s
-        return _SPARE * max(moving_rad, rest_a / self._loop.a_per_rad)
+        return _LEAD_FACTOR * max(moving_rad, rest_a / self._loop.a_per_rad)

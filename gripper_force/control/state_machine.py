@@ -65,8 +65,8 @@ _MIN_SPEED_M_S = 1e-4
 """Lowest speed of one jaw that gives a grasp more time: that for a target of 0.01 N."""
 
 _BLOCKED_S = 1.0
-_PASSED_M = 0.002
-_PASSED_SHARE = 0.25
+_PROGRESS_M = 0.002
+_PROGRESS_SHARE = 0.25
 """A move is blocked if the width does not change by this distance in this time; slow jaws: by this share of what their
 speed allows."""
 
@@ -74,7 +74,7 @@ _REFUSED = "refused "
 """Beginning of the event of a refused request."""
 
 _SAME_SHARE = 0.25
-"""Change of the target as a share of its tolerance that is none: the noise of a stream of requests."""
+"""A target that changes by at most this share of its tolerance is the same target: streams of requests are noisy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class GraspController:
         self._servo: ServoState | None = None
         self._target_n = self._held_width_m = self._settling_width_m = 0.0
         self._move_width_m = transmission.open_width_m
-        self._passed_m = self._stopped_s = 0.0
+        self._progress_width_m = self._stopped_s = 0.0
         self._move_opens = False
         self._released_s = math.inf
         self._grasp_ns, self._timeout_s = 0, 0.0
@@ -231,9 +231,9 @@ class GraspController:
     # Inputs.
 
     def _elapsed_s(self, t_ns: int) -> float:
-        before_ns = t_ns if self._t_ns is None else self._t_ns
+        previous_ns = t_ns if self._t_ns is None else self._t_ns
         self._t_ns = t_ns
-        return min(max(t_ns - before_ns, 0) / NS_PER_S, MAX_CYCLE_S)
+        return min(max(t_ns - previous_ns, 0) / NS_PER_S, MAX_CYCLE_S)
 
     def _read_sensors(self, t_ns: int, servo: ServoState, visual: VisualForce | None) -> list[Event]:
         if not is_plausible(servo):
@@ -263,8 +263,8 @@ class GraspController:
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""
-        before, self._derating = self._derating, self._safety.derating(temperature_c)
-        if self._derating == before or self._phase not in (Phase.RAMP, Phase.HOLD):
+        previous, self._derating = self._derating, self._safety.derating(temperature_c)
+        if self._derating == previous or self._phase not in (Phase.RAMP, Phase.HOLD):
             return []
         self._loop.retarget(self._derated_target_n)
         text = f"the servo is at {temperature_c:.0f} C; holding {self._derated_target_n:.2f} N"
@@ -353,13 +353,13 @@ class GraspController:
             self._start_travel(opens=opens)
             self._move_opens = opens
             self._enter(Phase.MOVE, self._reason)
-            self._passed_m, self._stopped_s = self._present_width_m, 0.0
+            self._progress_width_m, self._stopped_s = self._present_width_m, 0.0
         self._outcome, self._move_width_m = Outcome.NONE, width_m
 
     def _start_travel(self, *, opens: bool) -> None:
         if self._phase in GRIPPING:
             self._was_held = self._outcome == Outcome.HELD
-        grip_n = self._motor_force_n if self._phase in (*GRIPPING, Phase.FAULT) else self._grip_left_n
+        grip_n = self._motor_force_n if self._phase in (*GRIPPING, Phase.FAULT) else self._remaining_grip_n
         self._limits.reset(reverses=self._opens_freely and not opens)
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
         self._travel.start(self._goal_width_m, grip_n, opens=opens)
@@ -391,14 +391,14 @@ class GraspController:
     @property
     def _opens_freely(self) -> bool:
         """True if the jaws open, and have let go of what they held."""
-        return self._is_opening and self._travel.grip_left_n(self._phase_s) == 0
+        return self._is_opening and self._travel.remaining_grip_n(self._phase_s) == 0
 
     @property
-    def _grip_left_n(self) -> float:
+    def _remaining_grip_n(self) -> float:
         """Motor force of a grip that a release, a move, or an approach after one has not let go yet."""
         if self._phase == Phase.APPROACH:
-            return self._travel.grip_left_n(self._released_s + self._phase_s)
-        return self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
+            return self._travel.remaining_grip_n(self._released_s + self._phase_s)
+        return self._travel.remaining_grip_n(self._phase_s) if self._is_travelling else 0.0
 
     @property
     def _is_travelling(self) -> bool:
@@ -481,7 +481,7 @@ class GraspController:
         self._note_friction(closing_m_s)
 
     def _note_friction(self, closing_m_s: float) -> None:
-        """Takes over what this motion shows of friction."""
+        """Learns the friction that this motion shows."""
         if self._is_travelling:
             self._travel.note_friction(
                 self._phase_s, closing_m_s, self._measured_motor_force_n, opens=self._is_opening
@@ -505,7 +505,7 @@ class GraspController:
             self._friction.max_closing_force_n(closing=self._is_closing, approaching=True),
         )
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
-        self._motor_force_n = max(self._approach.motor_force_n, self._grip_left_n)
+        self._motor_force_n = max(self._approach.motor_force_n, self._remaining_grip_n)
         mean_n = self._travel.free_travel.mean_n
         if was_backing_off and not self._approach.is_backing_off and mean_n is not None:
             self._fusion.current.take_friction(mean_n)
@@ -541,18 +541,18 @@ class GraspController:
         return self._slip.loss_reason(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
 
     def _run_ramp(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        lost = self._step_loop(dt_s, width_m, closing_m_s)
+        loss = self._step_loop(dt_s, width_m, closing_m_s)
         if width_m < self._config.min_object_width_m and self._outcome == Outcome.NONE:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._start_release(self._reason)
-        elif lost:
-            self._handle_loss(width_m, lost)
+        elif loss:
+            self._handle_loss(width_m, loss)
         elif self._loop.reference_n == self._derated_target_n and not self._loop.is_lowering:
             self._error_n = self._estimate.force_n - self._derated_target_n
             self._enter(Phase.HOLD, f"at {self._derated_target_n:g} N")
 
     def _run_hold(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        lost = self._step_loop(dt_s, width_m, closing_m_s)
+        loss = self._step_loop(dt_s, width_m, closing_m_s)
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= self._tolerance_n
@@ -568,10 +568,10 @@ class GraspController:
             if self._derating < 1:
                 reason += f", reduced from {self._target_n:g} N because the servo is hot"
             self._set_outcome(Outcome.HELD, reason)
-        if not lost and self._outcome == Outcome.HELD:
-            lost = self._slip.recession_reason(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
-        if lost:
-            self._handle_loss(width_m, lost)
+        if not loss and self._outcome == Outcome.HELD:
+            loss = self._slip.recession_reason(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
+        if loss:
+            self._handle_loss(width_m, loss)
             return
         closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
         slip = self._slip.slip_reason(
@@ -619,15 +619,15 @@ class GraspController:
         self._motor_force_n, self._goal_width_m = self._travel.motor_force_n, self._travel.goal_width_m
         if self._outcome != Outcome.NONE:
             return
-        left_m = abs(width_m - self._move_width_m)
+        remaining_m = abs(width_m - self._move_width_m)
         friction_a = self._transmission.current_a(self._transmission.friction_n, self._present_rad)
-        rest_m = max(_AT_WIDTH_M, self._speed_limit.rest_error_m(friction_a, self._present_rad))
-        if abs(width_m - self._passed_m) > min(
-            _PASSED_M, _PASSED_SHARE * self._travel.speed_m_s * _BLOCKED_S
+        tolerance_m = max(_AT_WIDTH_M, self._speed_limit.rest_error_m(friction_a, self._present_rad))
+        if abs(width_m - self._progress_width_m) > min(
+            _PROGRESS_M, _PROGRESS_SHARE * self._travel.speed_m_s * _BLOCKED_S
         ):
-            self._passed_m, self._stopped_s = width_m, 0.0
+            self._progress_width_m, self._stopped_s = width_m, 0.0
         self._stopped_s += dt_s
-        if left_m <= rest_m and self._goal_width_m == self._move_width_m:
+        if remaining_m <= tolerance_m and self._goal_width_m == self._move_width_m:
             self._stopped_s = 0.0
             self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
         elif self._stopped_s >= _BLOCKED_S:
@@ -678,13 +678,13 @@ class GraspController:
                 closing=closing, approaching=self._phase == Phase.APPROACH
             )
             motor_force_n = min(motor_force_n, limit_n)
-        wanted = ServoCommand(
+        unlimited = ServoCommand(
             t_ns,
             self._transmission.position_rad(self._goal_width_m),
             abs(self._transmission.current_a(motor_force_n, self._present_rad)),
         )
         command, is_over = self._limits.apply(
-            wanted,
+            unlimited,
             force_n,
             friction_n,
             self._measured_motor_force_n,

@@ -15,7 +15,7 @@ _LET_GO_LEAD_S = 0.03
 """Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
 motor would add to the force of a springy object."""
 
-_FREELY_SHARE = 0.4
+_FREE_SHARE = 0.4
 """Share of the largest speed above which nothing resists: the motor force is then friction. The profile has half of
 that speed."""
 
@@ -97,11 +97,11 @@ class Travel:
             motor_force_n: Measured motor force at each jaw.
             opens: True if the jaws are to open.
         """
-        side = -1 if opens else 1
-        if not self._is_letting_go(t_s) and side * closing_m_s > _FREELY_SHARE * self.speed_m_s:
-            self.free_travel.add(side * motor_force_n)
+        sign = -1 if opens else 1
+        if not self._is_letting_go(t_s) and sign * closing_m_s > _FREE_SHARE * self.speed_m_s:
+            self.free_travel.add(sign * motor_force_n)
 
-    def grip_left_n(self, t_s: float) -> float:
+    def remaining_grip_n(self, t_s: float) -> float:
         """Returns what is left of the motor force of a grip, ``t_s`` after the start."""
         return self._grip_n * max(1 - t_s / _LET_GO_S, 0.0)
 
@@ -111,4 +111,4 @@ class Travel:
 
     def _force_n(self, t_s: float) -> float:
         """Returns the motor force of free travel, and at first what remains of a grip."""
-        return max(self._free_motor_force_n, self.grip_left_n(t_s))
+        return max(self._free_motor_force_n, self.remaining_grip_n(t_s))

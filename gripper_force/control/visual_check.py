@@ -42,7 +42,7 @@ class VisualCheck:
 
     def start(self) -> None:
         """Starts at the beginning of a grip."""
-        self._has_seen = self._has_unsure = False
+        self._has_seen = self._has_uncertain = False
         self._covered_ns: int | None = None
         self._before_n = max(self._force_n or 0.0, 0.0)
 
@@ -77,12 +77,12 @@ class VisualCheck:
         # A comparison with NaN is false.
         is_sure = not visual.is_familiar or 0 <= visual.std_n <= self._config.vision_std_n
         if not (abs(visual.force_n) <= 1e9 and is_sure):
-            self._has_unsure |= gripping
+            self._has_uncertain |= gripping
             return
         self._has_seen |= gripping
         dt_s = (visual.t_ns - self._t_ns) / NS_PER_S
-        before_n = visual.force_n if self._force_n is None else self._force_n
-        self._force_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _FILTER_S)
+        previous_n = visual.force_n if self._force_n is None else self._force_n
+        self._force_n = previous_n + (visual.force_n - previous_n) * dt_s / (dt_s + _FILTER_S)
         self._std_n = visual.std_n if visual.is_familiar else 0.0
         self._t_ns = visual.t_ns
 
@@ -98,14 +98,14 @@ class VisualCheck:
             current_n: Motor force beyond friction.
             is_held: True if the grip counts as held. It then takes less to confirm it, so that noise does not end it.
         """
-        by_friction = current_n < _PROVEN_SHARE * target_n
-        if by_friction and self._covered_ns is not None:
+        may_be_friction = current_n < _PROVEN_SHARE * target_n
+        if may_be_friction and self._covered_ns is not None:
             return "the object is gone, or the view is covered or blurred"
         if self._force_n is None:
-            return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""
+            return "the camera is uncertain" if self._has_uncertain and not self._has_seen else ""
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
         noise_n = 0.0 if is_held or self._before_n <= target_n else min(self._std_n, _NOISE_SHARE * target_n)
         has_risen = self._force_n - self._before_n >= _RISE_SHARE * target_n + noise_n
-        if has_risen and not (by_friction and self._force_n - target_n > beyond_n):
+        if has_risen and not (may_be_friction and self._force_n - target_n > beyond_n):
             return ""
         return f"the camera sees {self._force_n:.1f} N, and saw {self._before_n:.1f} N before the contact"

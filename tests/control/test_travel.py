@@ -61,7 +61,7 @@ def test_the_motor_force_of_a_grip_falls_to_that_of_free_travel(motion):
     assert forces_n[0] == 6.0
     assert forces_n == sorted(forces_n, reverse=True)
     assert forces_n[-1] == FREE_N
-    assert travel.grip_left_n(160 * CYCLE_S) == 0.0
+    assert travel.remaining_grip_n(160 * CYCLE_S) == 0.0
 
 
 def test_the_lead_after_a_grip_grows_from_zero():
