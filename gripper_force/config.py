@@ -31,7 +31,7 @@ HARD_FORCE_LIMIT_N: Final = 70.0
 """Upper bound of control.force_limit_n: the lowest limit that is quoted for a clamped finger."""
 
 VIRTUAL_PREFIX: Final = "virtual:"
-"""Begin of the name of a simulated bus in this process, as servo.port."""
+"""Prefix of a servo.port that names a simulated bus in this process."""
 
 _BACKEND: Final = "or package.module:Class, or a name that an installed package registers"
 
@@ -246,7 +246,7 @@ class CameraConfig(Section):
 
 
 CAMERA_OTHER_KEYS: Final = {"options", "path", "speed", "device", "timeout_ms"}
-"""Keys of the camera on which the look of its images does not depend."""
+"""Keys of the camera that do not change its images."""
 
 
 class LoadCellConfig(Section):
@@ -389,7 +389,7 @@ class ControlConfig(Section):
         None, description="time without an estimate after which vision drops out; null: 2.7 frame periods"
     )
     vision_age_ms: Positive | None = Field(
-        None, description="frame age above which an estimate is rejected; null: 83 ms and a frame period"
+        None, description="frame age above which an estimate is rejected; null: 83 ms plus a frame period"
     )
     vision_std_n: Positive = Field(1.5, description="standard deviation above which an estimate is rejected")
     learn_gain: bool = Field(
@@ -405,8 +405,9 @@ class ControlConfig(Section):
     min_object_width_m: Finite = Field(
         0.002,
         ge=-0.01,
-        description="width by the servo's angle below which closed jaws hold nothing; gear play and soft pads make it "
-        "1 to 3 mm less than the object's; for paper negative, so that only the camera can tell it from nothing",
+        description="width, computed from the servo's angle, below which closed jaws hold nothing; gear play and soft "
+        "pads make it 1 to 3 mm less than the object's; negative for paper, which only the camera can then tell from "
+        "no object",
     )
     slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that counts as slip")
     on_slip: Literal["regrip", "hold", "open"] = Field(
@@ -435,7 +436,7 @@ class ControlConfig(Section):
     plant_delay_ms: Positive | None = Field(
         None,
         description="delay from contact force to estimate (exposure to use, plus half a frame); null: from "
-        "the object profile, or 52 and half a frame period. With feedback=vision at least this default is "
+        "the object profile, or 52 plus half a frame period. With feedback=vision at least this default is "
         "used, and a lag of at most 60",
     )
 
@@ -494,7 +495,7 @@ class SimCameraConfig(Section):
     """Place and image of the simulated camera; the point between the jaws' tips is the origin."""
 
     position_m: Vector = Field(
-        (0.10, -0.30, 0.125), description="x: travel of the jaws, y: to the wall, z: up"
+        (0.10, -0.30, 0.125), description="x: along the travel of the jaws, y: towards the wall, z: up"
     )
     aim_m: Vector = Field((0.0, 0.0, 0.0), description="point in the middle of the image")
     fov_deg: float = Field(17.0, ge=2, le=120, description="field of view from edge to edge of the image")
@@ -556,7 +557,7 @@ class SimConfig(Section):
         description="seed of the gripper and its surroundings (camera, light, table, motor, gears, rods); null: seed",
     )
     size_spread: float = Field(0.04, ge=0, le=0.15, description="half-width of the uniform spread of size")
-    stiffness_spread: float = Field(0.05, ge=0, le=0.5, description="the same of the object's stiffness")
+    stiffness_spread: float = Field(0.05, ge=0, le=0.5, description="half-width of the spread of stiffness")
     stiffness_octaves: float = Field(
         0.0, ge=0, le=1, description="further, log-uniform spread; 1: factors 0.5 to 2"
     )
@@ -578,10 +579,10 @@ class SimConfig(Section):
     changing_light: bool = Field(False, description="light that changes slowly during a run, by up to 30 %")
     moving_background: bool = Field(False, description="things that move behind the object")
     camera_latency_ms: NonNegative = Field(15.0, description="time from mid-exposure to the frame")
-    exposure_ms: Positive = Field(4.0, description="exposure at camera.exposure_us 4000")
-    friction: Positive | None = Field(None, description="true friction over the default rig's; null: drawn")
-    gain: Positive | None = Field(None, description="true torque constant over the model's; null: drawn")
-    stiffness: Positive | None = Field(None, description="true stiffness over that of the kind; null: drawn")
+    exposure_ms: Positive = Field(4.0, description="simulated exposure time at camera.exposure_us=4000")
+    friction: Positive | None = Field(None, description="factor on the default rig's friction; null: drawn")
+    gain: Positive | None = Field(None, description="factor on the model's torque constant; null: drawn")
+    stiffness: Positive | None = Field(None, description="factor on the kind's stiffness; null: drawn")
     open_width_m: Positive | None = Field(None, description="true open width; null: gripper.open_width_m")
     hanging_mass_kg: NonNegative = Field(
         0.0, description="mass that pulls one jaw open; 0: none, and in `calibrate weight` the stated one"
@@ -647,7 +648,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _split_object(cls, tree: Any) -> Any:
-        """Makes of a simulated object's file, given as ``object``, its name and ``sim.object``."""
+        """Splits a simulated object's file, given as ``object``, into its name and ``sim.object``."""
         path, sim = (tree.get("object"), tree.get("sim", {})) if isinstance(tree, dict) else (None, None)
         if not str(path).endswith((".yaml", ".xml")) or not isinstance(sim, dict | SimConfig):
             return tree
@@ -662,8 +663,8 @@ class Config(Section):
                 "gripper.linkage.kind=finger has one moving finger, but servo.second.id names the servo of a "
                 "second one; set the kind to fingers"
             )
-        if strange := {fault.id for fault in self.faults} - {None, *self.servo.ids}:
-            raise ValueError(f"a fault has the id {strange.pop()}, but no servo has it; correct it")
+        if unknown_ids := {fault.id for fault in self.faults} - {None, *self.servo.ids}:
+            raise ValueError(f"a fault has the id {unknown_ids.pop()}, but no servo has it; correct it")
         return self
 
     @property
@@ -762,9 +763,9 @@ def config_from_text(text: str, where: str, overrides: Overrides | None = None) 
     Raises:
         ConfigError: A key or value is wrong. The message names it and ``where``.
     """
-    given: Tree = {}
-    _assign_all(given, overrides)
-    tree = merged(_upgraded(tree_from(text, where)), _rig_settings(given, "--set"))
+    override_tree: Tree = {}
+    _assign_all(override_tree, overrides)
+    tree = merged(_upgraded(tree_from(text, where)), _rig_settings(override_tree, "--set"))
     return _validated(lambda *_: {}, tree, where, overrides, {})
 
 
@@ -799,11 +800,11 @@ def _validated(
 ) -> Config:
     """Validates a tree with overrides. The message blames the first of them with which the tree is not valid."""
     layers = {where: (), "overrides" if isinstance(overrides, Mapping) else "--set": overrides, **options}
-    changed = deepcopy(tree)
+    copy = deepcopy(tree)
     try:
         for layer in layers.values():
-            _assign_all(changed, layer)
-        return config_from(merged(rig(changed, where), changed), where)
+            _assign_all(copy, layer)
+        return config_from(merged(rig(copy, where), copy), where)
     except ConfigError:
         for name, layer in layers.items():
             _assign_all(tree, layer)

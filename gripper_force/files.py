@@ -16,14 +16,14 @@ _TRIES: Final = 1000
 
 @contextmanager
 def unfinished(path: Path, *, wait: bool = False) -> Iterator[Path]:
-    """Gives a file to write beside ``path``, which gets that name at the end; after an error it stays where it is.
+    """Yields a file beside ``path`` to write, and renames it to ``path`` at the end; after an error it stays there.
 
-    One that an interrupted run left is removed first.
+    A file that an interrupted run left is removed first.
 
     Args:
         path: The file.
-        wait: True to wait for another writer, for a file that takes no time to write. What is read of the old file in
-            the block is then complete.
+        wait: True to wait for another writer, if writing takes no time. What the block reads of the old file is then
+            complete.
 
     Raises:
         DataError: Another process or thread writes the file.
@@ -35,7 +35,7 @@ def unfinished(path: Path, *, wait: bool = False) -> Iterator[Path]:
         part.replace(path)
 
 
-def make_place(path: Path) -> None:
+def make_folder_of(path: Path) -> None:
     """Creates the folder of a file. Raises `OSError` if the file can't be written there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent):

@@ -6,7 +6,7 @@ from pathlib import Path
 from gripper_force.errors import ConfigError
 
 
-def own_folder(variable: str, under_home: str) -> Path:
+def xdg_folder(variable: str, under_home: str) -> Path:
     """Returns this project's folder in one of https://specifications.freedesktop.org/basedir-spec/latest/.
 
     Args:

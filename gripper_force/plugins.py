@@ -99,16 +99,16 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
             "its module needs"
         ) from error
     try:
-        found: Any = attrgetter(attribute)(module)
+        target_class: Any = attrgetter(attribute)(module)
     except AttributeError as error:
         raise ConfigError(
             f"{key}={name}: the module {module_name} has no attribute {attribute!r}; name one of its classes"
         ) from error
-    if not callable(found):
+    if not callable(target_class):
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
-    if isinstance(found, type) or group == "servos":  # `spec` is read before a servo is made
-        _check_methods(found, group, f"{key}={name}: {target}")
-    return found if name in builtin else _Plugin(found, group, f"{key}={name}: {attribute}")
+    if isinstance(target_class, type) or group == "servos":  # `spec` is read before a servo is made
+        _check_methods(target_class, group, f"{key}={name}: {target}")
+    return target_class if name in builtin else _Plugin(target_class, group, f"{key}={name}: {attribute}")
 
 
 def _check_methods(part: Any, group: str, name: str) -> None:
@@ -132,8 +132,8 @@ def wrong_result(result: Any, expected: str, now_ns: Callable[[], int] | None = 
             it is of another clock, and one below a thousandth of it in another unit. Others may be old: a program that
             calls `Gripper.step` may pause.
     """
-    own = ("builtins", "gripper_force.")  # another class may have the same name
-    names = {base.__name__ for base in type(result).__mro__ if base.__module__.startswith(own)}
+    packages = ("builtins", "gripper_force.")  # another class may have the same name
+    names = {base.__name__ for base in type(result).__mro__ if base.__module__.startswith(packages)}
     if names.isdisjoint(expected.split()):
         return type(result).__name__
     if expected == "dict":
@@ -184,18 +184,18 @@ class _Plugin:
         return partial(self._call, value, f"{self._name}.{name}") if callable(value) else value
 
     def __call__(self, *arguments: Any) -> Any:
-        made = self._call(self._part, self._name, *arguments)
-        _check_methods(made, self._group, f"{self._name}()")
+        instance = self._call(self._part, self._name, *arguments)
+        _check_methods(instance, self._group, f"{self._name}()")
         for name in _ATTRIBUTES.get(self._group, ()):
-            self._call(getattr, f"{self._name}.{name}", made, name, None)  # checks it
+            self._call(getattr, f"{self._name}.{name}", instance, name, None)  # checks it
         # The second argument of a device is its clock, or the function. No result of an engine has a time.
         clock = next(iter(arguments[1:]), None)
-        return _Plugin(made, self._group, self._name, getattr(clock, "now_ns", clock))
+        return _Plugin(instance, self._group, self._name, getattr(clock, "now_ns", clock))
 
-    def _call(self, function: Callable[..., Any], called: str, *arguments: Any, **named: Any) -> Any:
+    def _call(self, function: Callable[..., Any], called: str, *arguments: Any, **keywords: Any) -> Any:
         try:
             with importing(called):  # a package may be imported only now
-                result = function(*arguments, **named)
+                result = function(*arguments, **keywords)
         except GripperError:
             raise
         except Exception as error:
@@ -229,6 +229,6 @@ def _target(group: str, builtin: Mapping[str, str], name: str, key: str) -> str:
     if targets:
         return targets[0]
     known = [*builtin, *sorted({point.name for point in points} - builtin.keys())]
-    close = get_close_matches(name, known, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    matches = get_close_matches(name, known, n=1)
+    hint = f" (did you mean {matches[0]!r}?)" if matches else ""
     raise ConfigError(f"unknown {key} {name!r}{hint}; use {', '.join(known)} or package.module:Class")

@@ -48,13 +48,13 @@ class Section(BaseModel):
         return Path(expanduser(valid)) if isinstance(valid, Path) else valid  # noqa: PTH111  # that one may raise
 
     def filled(self, **values: Any) -> Self:
-        """Returns a copy with these values, which are not validated, for those of the keys that are None."""
+        """Returns a copy in which the keys that are None have these values, which are not validated."""
         return self.model_copy(update={k: v for k, v in values.items() if getattr(self, k) is None})
 
 
 S = TypeVar("S", bound=Section)
 
-_NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
+_YAML_ERRORS = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
 """Exceptions of the YAML parser, among others for a date !!timestamp 2001-99-99, and a tag !!bool x."""
 
 _SCALARS = {
@@ -125,13 +125,13 @@ def assign_value(tree: Tree, key: str, value: Any) -> None:
     tree[leaf] = value
 
 
-def merged(under: Tree, over: Tree) -> Tree:
-    """Merges two trees; where both have a key, the value of ``over`` counts."""
-    both = dict(under)
-    for key, value in over.items():
-        below = both.get(key)
-        both[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
-    return both
+def merged(base: Tree, override: Tree) -> Tree:
+    """Merges two trees; where both have a key, the value of ``override`` counts."""
+    result = dict(base)
+    for key, value in override.items():
+        old = result.get(key)
+        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return result
 
 
 def validated(section: type[S], tree: Tree, where: str, what: str = "configuration") -> S:
@@ -176,11 +176,11 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
     return validated(section, tree, str(path), what)
 
 
-def differences(known: Tree, run: Tree) -> list[str]:
+def differences(expected: Tree, run: Tree) -> list[str]:
     """Describes the keys in which a run differs, as text. Missing keys, and lengths within 5 %, do not differ."""
-    pairs = [(key, value, run[key]) for key, value in known.items() if key in run and run[key] != value]
-    near = [type(a) is type(b) is float and isclose(a, b, rel_tol=0.05) for _, a, b in pairs]
-    return [f"{key} {a}, not {b}" for (key, a, b), same in zip(pairs, near, strict=True) if not same]
+    pairs = [(key, value, run[key]) for key, value in expected.items() if key in run and run[key] != value]
+    close = [type(a) is type(b) is float and isclose(a, b, rel_tol=0.05) for _, a, b in pairs]
+    return [f"{key} {a}, not {b}" for (key, a, b), is_same in zip(pairs, close, strict=True) if not is_same]
 
 
 def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldInfo]]:
@@ -224,7 +224,7 @@ for _tag, _pattern in _SCALARS.items():
 def _parse(text: str, what_fails: str) -> Any:
     try:
         return yaml.load(text, _Loader)  # noqa: S506  # it is a safe loader
-    except _NO_YAML as error:
+    except _YAML_ERRORS as error:
         raise ConfigError(f"{what_fails}: {_reason(error, text)}") from error
 
 
@@ -259,11 +259,11 @@ def _suggestion(root: type[Section], parts: list[str]) -> str:
     """Names the most similar known key path: first in the same section, then in all sections."""
     prefix = "".join(f"{part}." for part in parts[:-1])
     known = list(_section_at(root, parts[:-1]).model_fields)
-    here = [f"{prefix}{name}" for name in get_close_matches(parts[-1], known, 1)]
+    in_section = [f"{prefix}{name}" for name in get_close_matches(parts[-1], known, 1)]
     paths = [path for path, _ in keys(root)]
     same_leaf = [path for path in paths if path.rpartition(".")[2] == parts[-1]]
-    close = here or same_leaf or get_close_matches(".".join(parts), paths, 1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    matches = in_section or same_leaf or get_close_matches(".".join(parts), paths, 1)
+    return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
 def _section_at(root: type[Section], parts: list[str]) -> type[Section]:

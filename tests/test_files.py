@@ -10,7 +10,7 @@ import pytest
 
 from gripper_force.errors import DataError
 from gripper_force.files import unfinished
-from gripper_force.jobs.profile_files import check_place
+from gripper_force.jobs.profile_files import check_writable
 from gripper_force.vision import checkpoint_writer
 
 KILLED = """
@@ -58,7 +58,7 @@ def test_a_second_writer_is_refused_and_harms_nothing(tmp_path: Path) -> None:
     assert (names(tmp_path), path.read_text()) == (["a.mcap", "b.mcap"], "first")
 
 
-@pytest.mark.parametrize("check", [check_place, checkpoint_writer.check_place])
+@pytest.mark.parametrize("check", [check_writable, checkpoint_writer.check_writable])
 def test_a_check_of_the_place_leaves_the_file_of_a_running_writer(
     tmp_path: Path, check: Callable[[Path], None]
 ) -> None:

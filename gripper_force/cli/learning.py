@@ -79,9 +79,9 @@ def train(
     from gripper_force.jobs.training.train import train as job
     from gripper_force.runtime import process
     from gripper_force.vision.checkpoint import load_checkpoint
-    from gripper_force.vision.checkpoint_writer import check_place
+    from gripper_force.vision.checkpoint_writer import check_writable
 
-    check_place(checkpoint)
+    check_writable(checkpoint)
     settings = named(recipe, set_)
     start = load_checkpoint(init) if init else None
     if start is not None:

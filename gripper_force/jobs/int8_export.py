@@ -117,8 +117,8 @@ class _InputRecorder(TorchEngine):
         self._every, self._count = every, 0
 
     def _infer(self, frame: Floats) -> StepOutput:
-        self._count += self._begun
-        if self._begun and self._count % self._every == 0:
+        self._count += self._has_begun
+        if self._has_begun and self._count % self._every == 0:
             self.recorded.append([frame[None, None], *(np.array(tensor) for tensor in self._states)])
         return super()._infer(frame)
 

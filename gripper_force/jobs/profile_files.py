@@ -8,7 +8,7 @@ import numpy as np
 from safetensors.numpy import save
 
 from gripper_force.errors import ConfigError
-from gripper_force.files import make_place, unfinished
+from gripper_force.files import make_folder_of, unfinished
 from gripper_force.profiles.correction import ProfileArrays
 from gripper_force.profiles.object_profile import ObjectProfile, weights_path
 from gripper_force.profiles.rig_profile import (
@@ -24,15 +24,15 @@ from gripper_force.schema import dump
 def check_object_place(path: Path) -> None:
     """Creates the folder of an object profile. Raises `ConfigError` if the profile can't be written there."""
     _check_names(path)
-    check_place(path)
+    check_writable(path)
 
 
-def check_place(path: Path) -> None:
+def check_writable(path: Path) -> None:
     """Creates the folder of a file. Raises `ConfigError` if the file can't be written there."""
     if path.is_dir():
         raise ConfigError(f"can't write {path}: it is a folder; name a file in it")
     try:
-        make_place(path)
+        make_folder_of(path)
     except OSError as error:
         raise ConfigError(
             f"can't write {path}: {error.strerror}, {error.filename}; name another file"
@@ -72,7 +72,7 @@ def rig_to_update(path: Path) -> RigProfile:
     Raises:
         ConfigError: The file exists and is not a rig profile, or it can't be written.
     """
-    check_place(path)
+    check_writable(path)
     return read_rig(path) if path.exists() else RigProfile()
 
 

@@ -75,8 +75,8 @@ def with_bundle(config: Config) -> tuple[Config, str]:
     if network in (None, config.vision.checkpoint):
         return config, ""
     if config.vision.checkpoint != "default":
-        named = f"vision.checkpoint is {config.vision.checkpoint!r}; set it to default to use the bundle"
-        return config, f"did not use the network of the bundle {path.parent}, because {named}"
+        reason = f"vision.checkpoint is {config.vision.checkpoint!r}; set it to default to use the bundle"
+        return config, f"did not use the network of the bundle {path.parent}, because {reason}"
     config = config.with_values(calibration={"object": str(path)}, vision={"checkpoint": network})
     return config, f"used the bundle {path.parent}, made of {profile.touches} touches on {profile.date}"
 
@@ -85,10 +85,10 @@ def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
     """Fills in the plant and the object's ratio from the object profile, where the configuration leaves them open."""
     if profiles.object is None:
         return control
-    known: dict[str, object] = {"object_ratio": profiles.object.ratio}
+    values: dict[str, object] = {"object_ratio": profiles.object.ratio}
     if (plant := profiles.object.plant) is not None:
-        known |= {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
-    return control.filled(**known)
+        values |= {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
+    return control.filled(**values)
 
 
 def read_correction(
@@ -116,11 +116,11 @@ def read_correction(
     return load_correction(profiles.object_path, profiles.object, features, mismatches)
 
 
-def overridden(config: Config, profiles: Profiles) -> str:
+def override_note(config: Config, profiles: Profiles) -> str:
     """Names the values of the rig profile that the configuration overrides with others; empty without any."""
-    known = {} if profiles.rig is None else profiles.rig.settings()
-    used = config.model_dump(mode="json")
-    keys = ", ".join(f"{a}.{b}" for a in known for b, value in known[a].items() if used[a][b] != value)
+    rig = {} if profiles.rig is None else profiles.rig.settings()
+    run = config.model_dump(mode="json")
+    keys = ", ".join(f"{a}.{b}" for a in rig for b, value in rig[a].items() if run[a][b] != value)
     return keys and f"the configuration overrides {keys} of the rig profile; delete them to use its values"
 
 

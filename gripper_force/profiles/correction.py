@@ -71,12 +71,12 @@ class Correction:
 
     Attributes:
         profile: The profile.
-        differs: Differences between the calibration's network and camera and the run's, as text.
+        mismatches: Differences between the calibration's network and camera and the run's, as text.
         known: Frames of the calibration, for the out-of-distribution score; None if the network's limits count.
     """
 
-    def __init__(self, profile: ObjectProfile, arrays: ProfileArrays, differs: Sequence[str] = ()) -> None:
-        self.profile, self.differs = profile, tuple(differs)
+    def __init__(self, profile: ObjectProfile, arrays: ProfileArrays, mismatches: Sequence[str] = ()) -> None:
+        self.profile, self.mismatches = profile, tuple(mismatches)
         self._arrays, self.known = arrays, arrays.known
         self._z = NormalDist().inv_cdf(0.5 + profile.interval.coverage / 2)
 
@@ -101,7 +101,7 @@ class Correction:
 
 
 def load_correction(
-    path: Path, profile: ObjectProfile, features: int, differs: Sequence[str] = ()
+    path: Path, profile: ObjectProfile, features: int, mismatches: Sequence[str] = ()
 ) -> Correction:
     """Reads the safetensors file beside a profile.
 
@@ -109,7 +109,7 @@ def load_correction(
         path: The profile's file.
         profile: Its content.
         features: F, the number of features of the network's members together.
-        differs: As in `Correction`.
+        mismatches: As in `Correction`.
 
     Raises:
         ConfigError: The file is missing, damaged, of another profile, or of a network with other features.
@@ -142,7 +142,7 @@ def load_correction(
         )
     if not all(np.isfinite(array).all() for array in arrays.values()) or arrays.get("floor", [1.0])[0] <= 0:
         raise ConfigError(f"{arrays_path} holds values that are not finite, or a floor of 0; calibrate again")
-    known = None
+    frames = None
     if profile.ood_limits is not None:
-        known = KnownFrames(arrays["mean"], arrays["axes"], float(arrays["floor"][0]), profile.ood_limits)
-    return Correction(profile, ProfileArrays(arrays["head"], arrays["offset"], known), differs)
+        frames = KnownFrames(arrays["mean"], arrays["axes"], float(arrays["floor"][0]), profile.ood_limits)
+    return Correction(profile, ProfileArrays(arrays["head"], arrays["offset"], frames), mismatches)

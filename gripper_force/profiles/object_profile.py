@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.folders import own_folder
+from gripper_force.folders import xdg_folder
 from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, differences, read_section
 
 FORMAT: Final = "gripper-force-object/1"
@@ -53,11 +53,11 @@ class OutputCurve(Section):
 
     def at(self, estimate_n: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Returns the forces, (N,), for estimates (N,)."""
-        known_n, force_n = np.array(self.estimate_n, np.float64), np.array(self.force_n, np.float64)
+        knots_n, force_n = np.array(self.estimate_n, np.float64), np.array(self.force_n, np.float64)
         at_n = np.asarray(estimate_n, np.float64)
-        segment = np.clip(np.searchsorted(known_n, at_n) - 1, 0, len(known_n) - 2)
-        slope = np.diff(force_n) / np.diff(known_n)
-        return force_n[segment] + slope[segment] * (at_n - known_n[segment])
+        segment = np.clip(np.searchsorted(knots_n, at_n) - 1, 0, len(knots_n) - 2)
+        slope = np.diff(force_n) / np.diff(knots_n)
+        return force_n[segment] + slope[segment] * (at_n - knots_n[segment])
 
 
 class Interval(Section):
@@ -179,8 +179,8 @@ class ObjectProfile(Section):
             checkpoint: SHA-256 of the run's network.
             rig: The run's `Config.rig_settings`; missing keys are not compared.
         """
-        known = {"network": self.checkpoint[:12], **self.camera}
-        return differences(known, {"network": checkpoint[:12], **rig})
+        settings = {"network": self.checkpoint[:12], **self.camera}
+        return differences(settings, {"network": checkpoint[:12], **rig})
 
 
 def weights_path(path: Path) -> Path:
@@ -195,7 +195,7 @@ def read_object(path: Path) -> ObjectProfile:
 
 def user_folder() -> Path:
     """Returns the folder of the user's profiles. Raises `ConfigError` if there is none."""
-    return own_folder("XDG_DATA_HOME", ".local/share") / "objects"
+    return xdg_folder("XDG_DATA_HOME", ".local/share") / "objects"
 
 
 def find_object(name: str) -> Path:

@@ -156,11 +156,10 @@ class CameraCalibration(Section):
 
     def mismatches(self, camera: Tree) -> list[str]:
         """Returns the differences between the calibration and a run's section ``camera``, as text."""
-        named = {"backend", "side_px", "rate_hz", "gain", "exposure_us"}
-        mine = {**self.model_dump(mode="json", include=named), **self.image}
-        return [
-            f"camera.{key} {mine[key]}, not {camera.get(key)}" for key in mine if mine[key] != camera.get(key)
-        ]
+        keys = {"backend", "side_px", "rate_hz", "gain", "exposure_us"}
+        settings = {**self.model_dump(mode="json", include=keys), **self.image}
+        different = [(key, value) for key, value in settings.items() if value != camera.get(key)]
+        return [f"camera.{key} {value}, not {camera.get(key)}" for key, value in different]
 
 
 class RigProfile(Section):

@@ -116,8 +116,8 @@ def check_devices(config: Config, port: SharedPort | None = None) -> None:
     for unit in _SENSORS:
         name = getattr(config, unit).backend
         if name not in ("none", "simulated"):
-            follows = getattr(_sensor_class(config, unit), "supports_lockstep", False)
-            if config.clock == "lockstep" and not follows:
+            supports_lockstep = getattr(_sensor_class(config, unit), "supports_lockstep", False)
+            if config.clock == "lockstep" and not supports_lockstep:
                 raise ConfigError(f"{unit}.backend={name} cannot follow simulated time; set clock=realtime")
 
 

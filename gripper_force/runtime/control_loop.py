@@ -84,7 +84,7 @@ class ControlLoop:
     def request(self, request: PendingRequest) -> GraspResult | None:
         """Submits a request. Returns the result of an awaited one; where no thread runs the cycle, it does."""
         self._raise_error()
-        with self._own_cycle() if request.is_awaited else contextlib.nullcontext():
+        with self._exclusive_cycle() if request.is_awaited else contextlib.nullcontext():
             self._requests.submit(request)
             if not request.is_awaited:
                 return None
@@ -114,7 +114,7 @@ class ControlLoop:
         """Runs one cycle in the caller's thread."""
         if self._background:
             raise RequestError("a background thread runs the control cycle; open with background=False")
-        with self._own_cycle():
+        with self._exclusive_cycle():
             session = self.live_session()
             try:
                 token = _cycles.set((*_cycles.get(), self))
@@ -162,7 +162,7 @@ class ControlLoop:
             self._ended.wait(seconds)
             self.live_session()
             return
-        with self._own_cycle():
+        with self._exclusive_cycle():
             end_ns = self.state.t_ns + round(seconds * NS_PER_S)
             while self.step().t_ns < end_ns:
                 pass
@@ -186,8 +186,8 @@ class ControlLoop:
             with self._cycle_lock:  # a cycle of another thread, which is its last one, uses the devices
                 # An error of an earlier step ends the run as a fault even if the caller has handled it.
                 cause = self._error if error is None else error
-                raised = (None, None, None) if cause is None else (type(cause), cause, cause.__traceback__)
-                self._resources.__exit__(*raised)
+                exc_info = (None, None, None) if cause is None else (type(cause), cause, cause.__traceback__)
+                self._resources.__exit__(*exc_info)
             return
         with self._resources:
             trace = None if error is None else error.__traceback__
@@ -205,18 +205,18 @@ class ControlLoop:
                 self._raise_error()
 
     def lose(self, _owner: object) -> None:
-        """Gives the signals back once the program has lost its object; the control thread ends the run by itself."""
+        """Restores the signal handlers once the program has lost its object; the control thread then ends the run."""
         if self._background:  # otherwise these resources are those of the run, too
             self._resources.close()
 
-    def _interrupt(self, again: bool) -> None:
+    def _interrupt(self, even_at_end: bool) -> None:
         """Interrupts the program's own code at once, but a cycle in this thread, of any gripper, at its end."""
         if cycles := _cycles.get():
-            cycles[-1].session.interrupt(again)
-        elif again or not self._closing.is_set():
+            cycles[-1].session.interrupt(even_at_end)
+        elif even_at_end or not self._closing.is_set():
             raise KeyboardInterrupt
 
-    def _own_cycle(self) -> contextlib.ExitStack:
+    def _exclusive_cycle(self) -> contextlib.ExitStack:
         """Lets only this thread run the control cycle: a second one would use the servo's port at the same time."""
         if self in _cycles.get():
             raise RequestError("a device can't wait for the control cycle that calls it; pass wait=False")
@@ -226,9 +226,9 @@ class ControlLoop:
             raise RequestError(
                 "another thread runs the control cycle; pass wait=False, or use background=True"
             )
-        owned = contextlib.ExitStack()
-        owned.callback(self._cycle_lock.release)
-        return owned
+        stack = contextlib.ExitStack()
+        stack.callback(self._cycle_lock.release)
+        return stack
 
     def _close_at_exit(self) -> None:
         """Closes a gripper that the program forgot. The exception that ended the program is the cause."""
@@ -314,13 +314,13 @@ class ControlLoop:
     ) -> GripperState:
         """Makes the cycle's result visible to other threads, and ends the calls that waited for it."""
         assert session.servo_state is not None  # the cycle has read it
-        starts = request is not None and request.kind != RequestKind.STOP and not refusal
+        is_start = request is not None and request.kind != RequestKind.STOP and not refusal
         self.state, result = self._tracker.update(
             decision,
             session.servo_state,
             session.last_load_cell_sample,
             reason=session.reason,
-            restart=starts,
+            restart=is_start,
         )
         self._requests.finish_cycle(request, refusal, self.state, result)
         return self.state

@@ -176,10 +176,10 @@ class Gripper:
         """Moves the jaws to a width, and lets go of an object if one is gripped.
 
         The jaws move with the speed of a release (see ``control.approach_speed_m_s``), with a motor force of
-        ``control.approach_force_n`` and friction. So they press on an obstacle with ``control.approach_force_n`` and
-        the error of ``gripper.friction_n``, after an impact, and on an object that they held with up to twice the
-        friction more; always below ``control.force_limit_n``. A stream of widths with ``wait=False`` is followed: a
-        move in progress takes a new width without a stop.
+        ``control.approach_force_n`` plus friction. After the impact, they press on an obstacle with
+        ``control.approach_force_n`` plus the error of ``gripper.friction_n``. On an object that they held, that can be
+        more by twice the friction. All of it is below ``control.force_limit_n``. A stream of widths with
+        ``wait=False`` is followed: a move in progress takes a new width without a stop.
 
         Args:
             width_m: Distance between the jaws, in metres: 0 to ``gripper.open_width_m``.
@@ -252,11 +252,11 @@ class Gripper:
         """
         self._loop.sleep(seconds)
 
-    # Newest values. None of them blocks. All raise what ended the run, or a program that polls would wait for ever.
+    # Newest values. None of them blocks. All raise the error that ended the run: a program that polls must notice it.
 
     @property
     def state(self) -> GripperState:
-        """State after the newest control cycle. Its outcome is empty from the request of a grasp or a move on.
+        """State after the newest control cycle. Its outcome is empty once a grasp or a move was requested.
 
         Raises:
             RequestError: The gripper is closed.

@@ -168,7 +168,7 @@ CODEC_OF_TOPIC: Final = {codec.topic: codec for codec in (*_OWN.values(), *CODEC
 """Codecs of logs of this version and of older ones, whose events have a schema of their own."""
 
 
-def own_fields(schema: bytes) -> list[tuple[str, int, int]]:
+def record_fields(schema: bytes) -> list[tuple[str, int, int]]:
     """Returns name, number and type of the fields that hold a record, without those for viewers."""
     files = FileDescriptorSet.FromString(schema).file
     fields = (field for file in files for message in file.message_type for field in message.field)

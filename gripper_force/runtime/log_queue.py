@@ -10,7 +10,7 @@ from gripper_force.errors import LogError
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import Record
 
-ROOM: Final = 4096
+CAPACITY: Final = 4096
 """Records that may wait for the disk: about three seconds of a run."""
 
 _TIMEOUT_S: Final = 10.0
@@ -34,7 +34,7 @@ class LogQueue:
         self.lost = 0
         self._log = log
         self._error, self._remedy = "", "free some space, or name another folder (log.directory or --out)"
-        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(ROOM)
+        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(CAPACITY)
         self._thread: threading.Thread | None = None
         if not lockstep:
             self._thread = threading.Thread(target=self._run, name="log_queue", daemon=True)
@@ -93,11 +93,11 @@ class LogQueue:
         except Exception as error:
             self._lose(str(error) if isinstance(error, LogError) else f"{type(error).__name__}: {error}")
 
-    def _lose(self, why: str) -> None:
+    def _lose(self, reason: str) -> None:
         self.lost += 1
         if self._log.failed:
             self.lost += self._log.waiting
             self._log.waiting = 0
         elif not self._error:
             self._remedy = "correct the class of the device that gave them"
-        self._error = self._error or why
+        self._error = self._error or reason

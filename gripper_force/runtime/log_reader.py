@@ -27,7 +27,7 @@ from gripper_force.runtime.log_codecs import (
     METADATA_NAME,
     UTC_NAME,
     Codec,
-    own_fields,
+    record_fields,
 )
 from gripper_force.schema import as_path
 from gripper_force.types import NS_PER_S, Record
@@ -85,15 +85,15 @@ class LogReader:
         self.damaged: set[int] = set()
         self._recover = recover
         self._chunks: list[_Chunk] = []
-        self._scanned = 0
+        self._scan_end = 0
         try:
             with path.open("rb") as file:
                 self._scan(file)
         except OSError as error:
             raise LogError(f"can't read the log {path}: {error.strerror}; check the path") from error
         if CONFIG_NAME not in self.attachments:
-            why = "holds no configuration" if self.complete else "is empty, or damaged at its start"
-            raise LogError(f"{path} {why}, so it can't be used; leave it out")
+            problem = "holds no configuration" if self.complete else "is empty, or damaged at its start"
+            raise LogError(f"{path} {problem}, so it can't be used; leave it out")
         if not (self.complete or recover):
             raise LogError(self._describe_loss())
         self.config = self.attachments[CONFIG_NAME].decode(errors="replace")
@@ -125,9 +125,9 @@ class LogReader:
             LogError: A chunk is damaged (without ``recover``; with it the chunk is left out), or a topic is not as this
                 version writes it.
         """
-        if wrong := [one for one in types if one not in [*CODECS]]:  # at the call, not in the generator
-            known = ", ".join(sorted(one.__name__ for one in CODECS))
-            raise TypeError(f"{wrong[0]!r} is no type of the records in a log; pass some of {known}")
+        if unknown := [kind for kind in types if kind not in [*CODECS]]:  # at the call, not in the generator
+            names = ", ".join(sorted(kind.__name__ for kind in CODECS))
+            raise TypeError(f"{unknown[0]!r} is no type of the records in a log; pass some of {names}")
         return self._decoded(frozenset(types or CODECS))
 
     def _decoded(self, types: frozenset[type[Record]]) -> Iterator[Record]:
@@ -140,7 +140,7 @@ class LogReader:
             if not self._recover:
                 raise LogError(f"{self.path} is damaged ({error}); {_REMEDY}") from error
 
-    def _messages(self, wanted: frozenset[type[Record]]) -> Iterator[tuple[Codec, McapMessage]]:
+    def _messages(self, record_types: frozenset[type[Record]]) -> Iterator[tuple[Codec, McapMessage]]:
         schemas: dict[int, Schema] = {}
         codecs: dict[int, Codec | None] = {}
         for item in self._chunk_contents():
@@ -153,22 +153,22 @@ class LogReader:
                 schemas[item.id] = item
             elif isinstance(item, Channel):
                 codec = self._codec(item, schemas.get(item.schema_id))
-                codecs[item.id] = codec if codec.record_type in wanted else None
+                codecs[item.id] = codec if codec.record_type in record_types else None
 
     def _chunk_contents(self) -> Iterator[McapRecord]:
         """Yields schemas, channels and messages of each chunk; with ``recover`` a damaged chunk is left out."""
         with self.path.open("rb") as file:
-            for chunk in self._each_chunk():
+            for chunk in self._chunks_to_read():
                 file.seek(chunk.offset)
                 try:
-                    whole = _checked(Chunk.read(_stream(file.read(chunk.length))))
-                    yield from breakup_chunk(whole, validate_crc=True)
+                    contents = _checked(Chunk.read(_stream(file.read(chunk.length))))
+                    yield from breakup_chunk(contents, validate_crc=True)
                 except _DAMAGE:
                     if not self._recover:
                         raise
                     self.damaged.add(chunk.offset)
 
-    def _each_chunk(self) -> Iterator[_Chunk]:
+    def _chunks_to_read(self) -> Iterator[_Chunk]:
         """Yields the chunks to read; a log that is being written has more later (`GrowingLog`)."""
         yield from self._chunks
 
@@ -187,33 +187,33 @@ class LogReader:
 
     def _scan(self, file: BinaryIO) -> None:
         """Reads the framing of the records that were not read yet, and keeps the positions of complete ones."""
-        if not self._scanned:
+        if not self._scan_end:
             if not _MAGIC.startswith(file.read(len(_MAGIC))):
                 raise LogError(f"{self.path} is not an MCAP file; pass a log that gripper-force wrote")
-            self._scanned = len(_MAGIC)
-        file.seek(self._scanned)
+            self._scan_end = len(_MAGIC)
+        file.seek(self._scan_end)
         size = self.path.stat().st_size
         with contextlib.suppress(*_DAMAGE):
             while file.tell() + _FRAMING.size <= size:
                 opcode, length = _FRAMING.unpack(file.read(_FRAMING.size))
-                start = file.tell()
-                if start + length > size:
+                offset = file.tell()
+                if offset + length > size:
                     return
-                self._read_framed(file, opcode, start, length)
-                self._scanned = file.seek(start + length)
+                self._read_framed(file, opcode, offset, length)
+                self._scan_end = file.seek(offset + length)
                 if opcode == Opcode.FOOTER:
                     self.complete = file.read() == _MAGIC
                     return
 
-    def _read_framed(self, file: BinaryIO, opcode: int, start: int, length: int) -> None:
-        """Takes over what a reader needs before the messages: chunk positions, attachments and metadata."""
+    def _read_framed(self, file: BinaryIO, opcode: int, offset: int, length: int) -> None:
+        """Keeps what a reader needs before the messages: chunk positions, attachments and metadata."""
         if opcode == Opcode.CHUNK:
             start_ns, end_ns = _TIMES.unpack(file.read(_TIMES.size))
-            self._chunks.append(_Chunk(start, length, start_ns, end_ns))
+            self._chunks.append(_Chunk(offset, length, start_ns, end_ns))
         elif opcode == Opcode.ATTACHMENT:
             data = file.read(length)
-            stored = int.from_bytes(data[-4:], "little")  # 0: the tool that wrote the file computes none
-            if stored and zlib.crc32(data[:-4]) != stored:
+            stored_crc = int.from_bytes(data[-4:], "little")  # 0: the tool that wrote the file computes none
+            if stored_crc and zlib.crc32(data[:-4]) != stored_crc:
                 raise ValueError("an attachment is damaged")
             attachment = Attachment.read(_stream(data))
             self.attachments[attachment.name] = attachment.data
@@ -248,10 +248,10 @@ def _stream(data: bytes) -> ReadDataStream:
 
 def _is_readable(schema: bytes, codec: Codec) -> bool:
     """Returns True if the fields are those of the record, or lack only later ones whose default is zero."""
-    fields, known = own_fields(schema), own_fields(codec.schema)
-    missing = known[len(fields) :]
+    fields, expected = record_fields(schema), record_fields(codec.schema)
+    missing = expected[len(fields) :]
     defaults = {field.name: field.default for field in dataclasses.fields(codec.record_type)}
-    return fields == known[: len(fields)] and all(
+    return fields == expected[: len(fields)] and all(
         defaults[name] in (0.0, "", False) for name, _, _ in missing
     )
 

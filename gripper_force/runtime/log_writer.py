@@ -67,9 +67,9 @@ class LogWriter:
             file: BinaryIO = path.open("xb")
             self._file = file if wrap_file is None else wrap_file(file)
         except OSError as error:
-            there = "it exists already, and a log is never overwritten; move it away, or name another file"
-            is_there = isinstance(error, FileExistsError) and error.filename == str(path)
-            reason = there if is_there else f"{error.strerror} ({error.filename}); name another folder"
+            remedy = "it exists already, and a log is never overwritten; move it away, or name another file"
+            exists = isinstance(error, FileExistsError) and error.filename == str(path)
+            reason = remedy if exists else f"{error.strerror} ({error.filename}); name another folder"
             raise LogError(f"can't write the log {path}: {reason}") from error
         self._writer = Writer(self._file)
         try:

@@ -18,12 +18,12 @@ class CounterMonitor:
         """Takes the counters of a cycle. Returns the increases as a text, or an empty text."""
         if counts == self._reported or (t_ns < self._next_ns and not at_end):
             return ""
-        risen = {cause: count - self._reported.get(cause, 0) for cause, count in counts.items()}
+        increases = {cause: count - self._reported.get(cause, 0) for cause, count in counts.items()}
         self._reported = dict(counts)  # a device may return the same dictionary each time
-        news = [f"{count} {cause.replace('_', ' ')}" for cause, count in risen.items() if count]
-        if news:
+        texts = [f"{count} {cause.replace('_', ' ')}" for cause, count in increases.items() if count]
+        if texts:
             self._next_ns = t_ns + NS_PER_S
-        return ", ".join(news)
+        return ", ".join(texts)
 
 
 class LoadCellMonitor:
@@ -42,8 +42,8 @@ class LoadCellMonitor:
             self._period_ns += 0.2 * ((valid_ns[-1] - last_ns) / len(valid_ns) - self._period_ns)
             last_ns = valid_ns[-1]
         self._last_ns = last_ns
-        silent = t_ns - last_ns > max(_SILENCE_NS, _SILENCE_PERIODS * self._period_ns)
-        if silent == self._silent:
+        is_silent = t_ns - last_ns > max(_SILENCE_NS, _SILENCE_PERIODS * self._period_ns)
+        if is_silent == self._silent:
             return ""
-        self._silent = silent
-        return "no valid samples, so nothing to compare with" if silent else "valid samples again"
+        self._silent = is_silent
+        return "no valid samples, so nothing to compare with" if is_silent else "valid samples again"

@@ -54,8 +54,8 @@ class FrameProcessor:
 
     def __init__(self, estimator: Estimator | None) -> None:
         self._estimator = estimator
-        self._works = False
-        self._last: Gray | None = None
+        self._has_estimated = False
+        self._last_gray: Gray | None = None
         self._may_repeat: bool | None = None  # unknown
         self.renewal_ns: int | None = None
 
@@ -71,11 +71,11 @@ class FrameProcessor:
         """
         if self._estimator is None:
             return ProcessedFrame(frame, None)
-        repeats = self._last is not None and np.array_equal(frame.gray, self._last)
-        if self._last is not None and not self._works:
-            self._may_repeat = repeats and self._may_repeat is not False
-        self._last = frame.gray
-        if self._works and repeats and not self._may_repeat:
+        is_repeat = self._last_gray is not None and np.array_equal(frame.gray, self._last_gray)
+        if self._last_gray is not None and not self._has_estimated:
+            self._may_repeat = is_repeat and self._may_repeat is not False
+        self._last_gray = frame.gray
+        if self._has_estimated and is_repeat and not self._may_repeat:
             return ProcessedFrame(frame, None, "the camera repeats its last image; check whether it hangs")
         begin_ns, problem = time.perf_counter_ns(), ""
         try:
@@ -84,8 +84,8 @@ class FrameProcessor:
                 self._estimator.renew_reference()
             result = self._estimator.update(frame.gray)
         except Exception as error:
-            is_seen = isinstance(error, UnfamiliarFrameError) and math.isfinite(error.force_n)
-            if not (self._works or is_seen):
+            has_output = isinstance(error, UnfamiliarFrameError) and math.isfinite(error.force_n)
+            if not (self._has_estimated or has_output):
                 raise
             problem = str(error) if isinstance(error, GripperError) else f"{type(error).__name__}: {error}"
             if not isinstance(error, UnfamiliarFrameError):
@@ -94,7 +94,7 @@ class FrameProcessor:
         compute_ms = (time.perf_counter_ns() - begin_ns) / NS_PER_MS
         if result is None:
             return ProcessedFrame(frame, None)
-        self._works = True
+        self._has_estimated = True
         ready_ns = frame.received_ns if now_ns is None else now_ns()
         visual = VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
         # The network has not run on a covered view.
@@ -129,14 +129,14 @@ class LockstepPerception:
     def poll(self) -> list[ProcessedFrame]:
         """Returns the frames that became ready since the last call, oldest first."""
         now_ns = self._clock.now_ns()
-        busy = self._under_way and self._under_way[-1][0] > now_ns
-        if not busy and self._camera is not None and (frame := self._camera.newest()) is not None:
+        is_busy = self._under_way and self._under_way[-1][0] > now_ns
+        if not is_busy and self._camera is not None and (frame := self._camera.newest()) is not None:
             ready_ns = now_ns + self._compute_ns
             self._under_way.append((ready_ns, self.processor.process(frame, lambda: ready_ns)))
-        ready = []
+        ready_frames = []
         while self._under_way and self._under_way[0][0] <= now_ns:
-            ready.append(self._under_way.popleft()[1])
-        return ready
+            ready_frames.append(self._under_way.popleft()[1])
+        return ready_frames
 
     def close(self) -> None:
         """Has no effect: there is no thread."""
@@ -154,7 +154,7 @@ class ThreadedPerception:
 
     def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
         self._camera, self.processor, self._clock = camera, FrameProcessor(estimator), clock
-        self._done: deque[ProcessedFrame] = deque()
+        self._processed: deque[ProcessedFrame] = deque()
         self._failure: Exception | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="perception", daemon=True)
@@ -168,7 +168,7 @@ class ThreadedPerception:
         """Returns the frames that became ready since the last call; re-raises an exception of the thread."""
         if self._failure is not None:
             raise self._failure
-        return [self._done.popleft() for _ in range(len(self._done))]
+        return [self._processed.popleft() for _ in range(len(self._processed))]
 
     def close(self) -> None:
         """Stops the thread; gives up after 1 s if the estimator hangs. May be called twice."""
@@ -184,7 +184,7 @@ class ThreadedPerception:
                 if frame is None:
                     self._stop.wait(self._IDLE_S)
                     continue
-                self._done.append(self.processor.process(frame, self._clock.now_ns))
+                self._processed.append(self.processor.process(frame, self._clock.now_ns))
         except Exception as error:  # re-raised in the control thread
             self._failure = error
 

@@ -115,11 +115,11 @@ def real_time_priority() -> Iterator[str]:
     if not hasattr(os, "sched_setscheduler"):
         yield "the control loop has no real-time priority, so cycles may start late; use Linux for a real gripper"
         return
-    before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except PermissionError:
-        is_ordinary = before & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER  # another one is the user's choice
+        is_ordinary = policy & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER  # another one is the user's choice
         if is_ordinary:
             _set_time_slice(_SLICE_NS)
         try:
@@ -131,15 +131,15 @@ def real_time_priority() -> Iterator[str]:
             if is_ordinary:
                 _set_time_slice(0)
         return
-    earlier: list[tuple[int, os.sched_param]] = _priorities.__dict__.setdefault("earlier", [])
-    earlier.append((before, parameter))
+    saved_settings: list[tuple[int, os.sched_param]] = _priorities.__dict__.setdefault("earlier", [])
+    saved_settings.append((policy, parameter))
     try:
         yield ""
     finally:
         # In whatever order the grippers of a thread are closed, the last one brings the thread's priority back.
-        before, parameter = earlier.pop()
+        policy, parameter = saved_settings.pop()
         # An unprivileged process cannot clear this flag once it is set.
-        os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameter)
+        os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameter)
 
 
 def _set_time_slice(slice_ns: int) -> None:
@@ -160,7 +160,7 @@ def deferred_signals(interrupt: Callable[[bool], None]) -> Iterator[None]:
     """Calls ``interrupt`` on a signal of `SIGNALS` instead of raising at once, if the program allows it.
 
     An exception in the middle of a bus transaction would leave the transaction incomplete. Of several open
-    grippers, the newest is interrupted. Its argument is True for Ctrl-C, which interrupts also what ends already.
+    grippers, the newest is interrupted. Its argument is True for Ctrl-C, which also interrupts a run that is ending.
     """
     if not _allowed.signals or threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
@@ -220,11 +220,11 @@ def _handle_signal(number: int, frame: FrameType | None) -> None:
         return
     # The last gripper was closed in another thread, which could not restore the handlers.
     _restore_handlers()
-    earlier = _earlier_handlers[number]
-    if callable(earlier):
-        earlier(number, frame)
-    elif earlier == signal.SIG_DFL:
-        signal.signal(number, earlier)
+    handler = _earlier_handlers[number]
+    if callable(handler):
+        handler(number, frame)
+    elif handler == signal.SIG_DFL:
+        signal.signal(number, handler)
         signal.raise_signal(number)
 
 

@@ -20,9 +20,9 @@ _MAX_MAGNITUDE: Final = 1e9
 def checked_number(value: Any, name: str) -> float:
     """Returns an argument as a float. Raises `RequestError` if it is no number, or too large to be plausible."""
     with suppress(TypeError, ValueError, OverflowError, RuntimeError):
-        plain = value.item() if hasattr(value, "item") else value  # of NumPy, or a tensor, also on a GPU
-        if not isinstance(plain, str | bytes | bool) and abs(found := float(value)) <= _MAX_MAGNITUDE:
-            return found
+        scalar = value.item() if hasattr(value, "item") else value  # NumPy, or a tensor, also on a GPU
+        if not isinstance(scalar, str | bytes | bool) and abs(number := float(value)) <= _MAX_MAGNITUDE:
+            return number
     raise RequestError(f"{name} of {value!r} is not a number of at most {_MAX_MAGNITUDE:g}; pass a float")
 
 
@@ -75,7 +75,7 @@ class RequestQueue:
         self._lock = threading.RLock()  # a signal handler may stop the gripper
         self._queued: list[PendingRequest] = []
         self._started: list[PendingRequest] = []  # only those that a caller waits for
-        self._phase, self._why = Phase.OPEN, ""
+        self._phase, self._fault_note = Phase.OPEN, ""
         self._is_closed = False
 
     def submit(self, request: PendingRequest) -> None:
@@ -89,7 +89,7 @@ class RequestQueue:
                 raise RequestError(CLOSED)
             if request.kind != RequestKind.RELEASE and self._will_be_at_fault():
                 raise RequestError(
-                    f"the {request.kind} request was refused: stopped or in fault{self._why}; call release first"
+                    f"the {request.kind} request was refused: stopped or in fault{self._fault_note}; call release first"
                 )
             if request.needs_object and self._phase not in GRIPPING:
                 raise RequestError(f"no object is gripped (phase {self._phase}); call grasp first")
@@ -127,7 +127,8 @@ class RequestQueue:
             result: Result for the requests that end with this state.
         """
         with self._lock:
-            self._phase, self._why = state.phase, f" ({state.reason})" if state.phase == Phase.FAULT else ""
+            self._phase = state.phase
+            self._fault_note = f" ({state.reason})" if state.phase == Phase.FAULT else ""
             if request is not None and not self._is_closed:
                 self._start(request, refusal)
             for started in self._started:

@@ -122,7 +122,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     config = config.with_values(gripper=_complete_gripper(config.gripper, spec), control=control)
     correction = apply.read_correction(config, profiles, model)
     mismatches = {
-        "object profile": () if correction is None else correction.differs,
+        "object profile": () if correction is None else correction.mismatches,
         "rig profile": apply.rig_mismatches(config, profiles),
         "network": () if model is None or correction else model.header.mismatches(config.rig_settings()),
     }
@@ -130,12 +130,12 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         ("vision", choice),
         ("session", bundle),
         ("simulation", detail),
-        ("session", apply.overridden(config, profiles)),
+        ("session", apply.override_note(config, profiles)),
         ("session", "" if model is None or _has_score(config, model) else _NO_SCORE),
         *(
-            ("session", f"the {profile} was made with {'; '.join(found)}")
-            for profile, found in mismatches.items()
-            if found
+            ("session", f"the {profile} was made with {'; '.join(differences)}")
+            for profile, differences in mismatches.items()
+            if differences
         ),
     ]
     return ResolvedConfig(

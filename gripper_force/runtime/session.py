@@ -137,7 +137,7 @@ class Session:
         state = self._devices.servo.start()  # if it raises, it has turned torque off itself
         self._armed = True
         if problem := wrong_result(state, "ServoState", self._devices.clock.now_ns):
-            # Of a user's class, whose torque is on now. Only a session can turn it off as configured.
+            # A user's class returned it, and its torque is on. Only a session can turn it off as configured.
             name = self.resolved.config.servo.backend
             raise DeviceError(f"servo.backend={name}: start() returned {problem}; return a ServoState")
         if problem := self._controller.start_problem(state):
@@ -174,18 +174,18 @@ class Session:
         """Makes the next cycle a stop, before any other request. Any thread or signal handler may call it."""
         self._stop_requested = True
 
-    def interrupt(self, again: bool = True) -> None:
+    def interrupt(self, even_at_end: bool = True) -> None:
         """Makes the next cycle raise `KeyboardInterrupt` before it accesses the servo.
 
         Args:
-            again: False: has no effect once the run is ending.
+            even_at_end: False: has no effect once the run is ending.
 
         Raises:
             KeyboardInterrupt: An earlier interrupt is still pending.
         """
-        if self._interrupted and again:
+        if self._interrupted and even_at_end:
             raise KeyboardInterrupt
-        self._interrupted |= again or self._error is None
+        self._interrupted |= even_at_end or self._error is None
 
     def raise_if_interrupted(self) -> None:
         """Raises the pending `KeyboardInterrupt`, if there is one."""
@@ -226,7 +226,7 @@ class Session:
         if self._stop_requested:
             self._stop_requested, request = False, Request(state.t_ns, RequestKind.STOP)
         decision = self._controller.step(state.t_ns, state, visual, request)
-        # At once: the log has a frame that is processed in the meantime after this cycle, as a replay renews it.
+        # Before the write, as in a replay: the log has a frame that is processed meanwhile after this cycle.
         if request is not None and request.new_object and not decision.refusal:
             self._perception.processor.renewal_ns = state.t_ns
         devices.servo.write(decision.command)
@@ -320,11 +320,11 @@ class Session:
         try:
             if self._armed:
                 self._devices.servo.stop(hold=self._end_action == "hold")
-        except DeviceError as second:
-            first, self._error = self._error, second
-            if not isinstance(first, GripperError):
+        except DeviceError as error:
+            cause, self._error = self._error, error
+            if not isinstance(cause, GripperError):
                 raise
-            raise type(first)(f"{first}; and the servo could not be stopped: {second}") from first
+            raise type(cause)(f"{cause}; and the servo could not be stopped: {error}") from cause
         finally:
             self._perception.close()
             self._log_sensors(self._devices.clock.now_ns(), at_end=True)

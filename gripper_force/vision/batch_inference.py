@@ -122,18 +122,18 @@ def _batches(frames: Iterable[Gray], device: torch.device) -> Iterator[Tensor]:
         yield torch.from_numpy(np.stack(part))[None].to(device)
 
 
-def _normalised(parts: Iterator[Tensor], preprocess: Preprocess) -> Iterator[Tensor]:
+def _normalised(batches: Iterator[Tensor], preprocess: Preprocess) -> Iterator[Tensor]:
     """Yields batches of a recording's frames, (1, N, S, S), prepared for the networks."""
-    first: list[Tensor] = []
+    leading_batches: list[Tensor] = []
     while (
-        sum(part.shape[1] for part in first) < preprocess.reference_frames
-        and (part := next(parts, None)) is not None
+        sum(batch.shape[1] for batch in leading_batches) < preprocess.reference_frames
+        and (batch := next(batches, None)) is not None
     ):
-        first.append(part)
-    if first:
-        leading = torch.cat(first, dim=1)[:, : preprocess.reference_frames]
-        for part in chain(first, parts):
-            yield normalise(part, leading, preprocess)
+        leading_batches.append(batch)
+    if leading_batches:
+        leading = torch.cat(leading_batches, dim=1)[:, : preprocess.reference_frames]
+        for batch in chain(leading_batches, batches):
+            yield normalise(batch, leading, preprocess)
 
 
 def _read(streams: "Sequence[_NetworkStream]") -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
@@ -149,7 +149,7 @@ class _NetworkStream:
         self._uses_bfloat16 = precision == "bfloat16"
         self._parts: list[Tensor] = []
         self._maps: Tensor | None = None
-        self._before: Tensor | None = None
+        self._earlier: Tensor | None = None
         self.pending_frames = 0
 
     def push(self, batch: Tensor) -> None:
@@ -167,13 +167,11 @@ class _NetworkStream:
         features = torch.cat(self._parts)
         self._parts, self.pending_frames = [], 0
         if isinstance(self._network, ForceNetwork):
-            earlier = self._network.config.window - 1
-            before = features[:1].expand(earlier, -1) if self._before is None else self._before
-            pooled = torch.cat([before, features])
-            self._before = pooled[len(pooled) - earlier :]
-            features = torch.tanh(
-                self._network.dense(_over_windows(self._network.blstm, pooled, earlier + 1))
-            )
+            count = self._network.config.window - 1
+            earlier = features[:1].expand(count, -1) if self._earlier is None else self._earlier
+            pooled = torch.cat([earlier, features])
+            self._earlier = pooled[len(pooled) - count :]
+            features = torch.tanh(self._network.dense(_over_windows(self._network.blstm, pooled, count + 1)))
         return self._network.force_n(features), features
 
 

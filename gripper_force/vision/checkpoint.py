@@ -84,11 +84,11 @@ def _member(
             GaussianProcess(config) if isinstance(config, GaussianProcessConfig) else ForceNetwork(config)
         )
     dtypes = {name: tensor.dtype for name, tensor in network.state_dict().items()}
-    own = {
+    weights = {
         _current_name(name.removeprefix(prefix)): t for name, t in tensors.items() if name.startswith(prefix)
     }
     # A copy, because the tensors share the file's bytes, which are read-only.
-    state = {name: t.to(dtypes.get(name, t.dtype), copy=True) for name, t in own.items()}
+    state = {name: t.to(dtypes.get(name, t.dtype), copy=True) for name, t in weights.items()}
     try:
         network.load_state_dict(state, assign=True)
     except RuntimeError as error:

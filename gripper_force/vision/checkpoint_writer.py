@@ -7,7 +7,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
-from gripper_force.files import make_place, unfinished
+from gripper_force.files import make_folder_of, unfinished
 from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.header import FORMAT, Header, digest_of, read_checkpoint
 
@@ -29,7 +29,7 @@ def save_checkpoint(path: Path, networks: Sequence[Member], header: Header) -> N
     _write(path, tensors, header)
 
 
-def check_place(path: Path) -> None:
+def check_writable(path: Path) -> None:
     """Creates the folder of a checkpoint, before hours of work for it.
 
     Raises:
@@ -37,10 +37,10 @@ def check_place(path: Path) -> None:
     """
     if path.is_dir():
         raise CheckpointError(f"can't write the checkpoint {path}: it is a folder; name a file")
-    if path.suffix != ".safetensors":  # of an exported network, or of the figure that is drawn beside
+    if path.suffix != ".safetensors":  # such as that of an exported network, or of the figure drawn beside it
         raise CheckpointError(f"can't write a checkpoint to {path}; name a file that ends in .safetensors")
     try:
-        make_place(path)
+        make_folder_of(path)
     except OSError as error:
         raise CheckpointError(
             f"can't write the checkpoint {path}: {error.strerror}; name another file"
@@ -59,8 +59,8 @@ def replace_header(source: str | Path, header: Header, out: Path | None = None) 
         CheckpointError: A file can't be read or written.
         DataError: Another process or thread writes the checkpoint.
     """
-    path, data, before = read_checkpoint(source)
-    identity = digest_of(data, before)
+    path, data, old_header = read_checkpoint(source)
+    identity = digest_of(data, old_header)
     _write(out or path, load(data), header.model_copy(update={"identity": identity}))
 
 

@@ -48,11 +48,11 @@ class EnsembleStep(nn.Module):
                 outputs.append(member.step(frame))
                 continue
             assert isinstance(member, ForceNetwork)
-            first = _first_state(member.config)
-            maps = member.zero_state().maps if first else inputs.pop(0)
+            first_state = _first_state(member.config)
+            maps = member.zero_state().maps if first_state else inputs.pop(0)
             output, state_after = member.step(frame, StreamState(maps, inputs.pop(0), inputs.pop(0)))
             outputs.append(output)
-            next_states += state_after[first:]
+            next_states += state_after[first_state:]
         attention = [] if self._ssam_member is None else [_map(outputs[self._ssam_member].gates)]
         forces_n = torch.cat([output.force_n for output in outputs])
         features = torch.cat([output.features[0] for output in outputs])
@@ -61,7 +61,7 @@ class EnsembleStep(nn.Module):
     def zero_states(self) -> list[Tensor]:
         """Returns states of zeros, in the order in which `forward` takes them."""
         networks = [member for member in self.members if isinstance(member, ForceNetwork)]
-        return [part for one in networks for part in one.zero_state()[_first_state(one.config) :]]
+        return [state for net in networks for state in net.zero_state()[_first_state(net.config) :]]
 
 
 def state_names(members: Sequence[NetworkConfig | GaussianProcessConfig]) -> list[str]:

@@ -62,8 +62,8 @@ class ForceEstimator:
         self._preprocess, members = engine.header.preprocess, engine.header.members
         self._sizes = len(members), sum(member.head for member in members)
         self._correction = correction
-        own = None if correction is None else correction.known
-        self._ood = None if engine.header.ood is None else OodScore(engine.header.ood, own)
+        object_frames = None if correction is None else correction.known
+        self._ood = None if engine.header.ood is None else OodScore(engine.header.ood, object_frames)
         self._views = engine.header.views if correction is None else None
         self.reset()
 
@@ -145,8 +145,8 @@ class ForceEstimator:
         last, shape = self._last, self._shape
         self.reset()
         self._last, self._shape, self._has_no_reference = last, shape, True
-        for small in last:
-            self._steps(small)
+        for image in last:
+            self._steps(image)
         self._has_no_reference = False
 
     @property
@@ -172,25 +172,25 @@ class ForceEstimator:
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network returned NaN or infinity.
         """
-        small = downscale(gray, self._region, self._preprocess.size)
+        image = downscale(gray, self._region, self._preprocess.size)
         # The region is in pixels, and the reference shows the view of another size.
         if self._shape not in (None, gray.shape):
             remedy = "keep the camera's resolution, or start a new stream"
             raise DataError(f"the frame is {gray.shape}, but the stream began with {self._shape}; {remedy}")
-        self._last.append(small)
+        self._last.append(image)
         if self._has_no_reference:
             raise DataError(
                 "there is no reference: the view was flat or moved when it was renewed; renew it before a still view "
                 "(grasp with new_object=True)"
             )
-        steps = self._steps(small)
+        steps = self._steps(image)
         self._shape = gray.shape
         return self._estimate(steps[-1]) if steps else None
 
-    def _steps(self, small: Gray) -> list[StepOutput]:
+    def _steps(self, image: Gray) -> list[StepOutput]:
         """Returns the networks' outputs for the frames that became ready with the next one, (S, S)."""
-        self._frame_checks.check(small)
-        return [self._engine.step(frame) for frame in self._normaliser.push(small)]
+        self._frame_checks.check(image)
+        return [self._engine.step(frame) for frame in self._normaliser.push(image)]
 
     def _estimate(self, step: StepOutput) -> ForceEstimate:
         """Returns the estimate for the networks' output."""

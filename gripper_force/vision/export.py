@@ -61,12 +61,12 @@ def export(model: Model, path: Path) -> ExportErrors:
         ConfigError: The suffix is unknown, or a package is not installed.
         CheckpointError: The checkpoint can't be read, or the exported network computes something else.
     """
-    with written(path) as made:
+    with written(path) as part:
         if path.suffix == ".xml":
-            save_openvino(openvino_network(model), model, made)
+            save_openvino(openvino_network(model), model, part)
         else:
-            _save_onnx(model, made)
-        return export_errors(model, made)
+            _save_onnx(model, part)
+        return export_errors(model, part)
 
 
 @contextmanager
@@ -178,19 +178,19 @@ def export_errors(model: Model, path: Path, frames: Sequence[Gray] | None = None
     if frames is None:
         size = model.header.preprocess.size
         frames = [np.random.default_rng(0).integers(0, 256, (_CHECKED, size, size), np.uint8)]
-    made = Model(path, model.header, model.digest)
+    exported_model = Model(path, model.header, model.digest)
     expected, exported = (
         [step for clip in frames for step in stream(engine, clip)]
-        for engine in (TorchEngine(model), open_engine(made, EXPORTED[path.suffix]))
+        for engine in (TorchEngine(model), open_engine(exported_model, EXPORTED[path.suffix]))
     )
     for name in ("forces_n", "features", "attention"):
         if getattr(expected[0], name) is None:  # no attention
             continue
-        theirs, ours = (np.stack([getattr(step, name) for step in steps]) for steps in (expected, exported))
-        scale = np.abs(theirs).max()
+        values = [np.stack([getattr(step, name) for step in steps]) for steps in (expected, exported)]
+        scale = np.abs(values[0]).max()
         if name == "forces_n":
             scale = max(member.label_scale_n for member in model.header.members)
-        largest = np.abs(theirs - ours).max()
+        largest = np.abs(values[0] - values[1]).max()
         if not np.isfinite(largest) or (exact and largest > TOLERANCE * scale):
             raise CheckpointError(
                 f"the exported {path.suffix} file differs from PyTorch by {largest:.2g} in {name}; "

@@ -33,19 +33,19 @@ def export_apart(model: Model, path: Path) -> None:
     elsewhere = "run `gripper-force export network` on another machine and set vision.checkpoint to its file"
     require("torch", f"exporting {model.path.name} for {EXPORTED[path.suffix]}", f", or {elsewhere}")
     try:
-        code, said = _run(str(model.path.absolute()), str(path.absolute()))
+        code, output = _run(str(model.path.absolute()), str(path.absolute()))
     except OSError as error:
         raise CheckpointError(
             f"can't export {model.path}: can't start sys.executable, {sys.executable!r}: {error.strerror}; {elsewhere}"
         ) from error
     if code == 0:
         return
-    last = said.strip().rpartition("\n")[2]
-    name, _, text = last.partition(": ")
+    last_line = output.strip().rpartition("\n")[2]
+    name, _, message = last_line.partition(": ")
     kind = getattr(errors, name, None)
     if isinstance(kind, type) and issubclass(kind, GripperError):
-        raise kind(text)
-    cause = last or "it said nothing, perhaps for lack of memory"
+        raise kind(message)
+    cause = last_line or "it said nothing, perhaps for lack of memory"
     raise CheckpointError(
         f"can't export {model.path}: the process ended with code {code}: {cause}; {elsewhere}"
     )
@@ -69,8 +69,8 @@ def _run(*arguments: str) -> tuple[int, str]:
         start_new_session=True,
     ) as process:
         assert process.stderr is not None
-        said = process.stderr.read()
-    return process.returncode, said
+        output = process.stderr.read()
+    return process.returncode, output
 
 
 def _main() -> None:

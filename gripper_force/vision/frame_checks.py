@@ -50,13 +50,13 @@ _MIN_STILL: Final = 0.25
 """Smallest share of the image that must follow the fitted change. In presses it is 0.5 or more."""
 
 _LARGE_SHIFT: Final = 0.3
-"""Largest shift that is looked for by correlation, as a share of the image's side. The fit finds the smallest."""
+"""Largest shift that is looked for by correlation, as a share of the image's side. The fit finds small ones."""
 
 _FEW_STILL: Final = 0.6
 """Share of the image that follows the fitted change, below which a larger shift is looked for."""
 
 _EXPLAINED: Final = 0.05
-"""Part of the image by which a large shift must explain more of it than none does. In presses it explains less."""
+"""Share of the image that a large shift must explain beyond what no shift explains. In presses it explains less."""
 
 _SMOOTHING_PX: Final = 0.8
 """Standard deviation of the smoothing against noise, in pixels."""
@@ -81,39 +81,39 @@ class FrameChecks:
     def __init__(self, max_covered: float = MAX_COVERED) -> None:
         """Starts a stream; ``max_covered`` is the largest share of the image that may lose its fine detail."""
         self._max_covered = max_covered
-        self._first: tuple[float, float, float] | None = None
+        self._first_values: tuple[float, float, float] | None = None
 
-    def check(self, small: Gray) -> None:
+    def check(self, image: Gray) -> None:
         """Checks the next frame.
 
         Args:
-            small: Cropped and resized frame, (S, S) uint8.
+            image: Cropped and resized frame, (S, S) uint8.
 
         Raises:
             DataError: The frame is flat, or differs from the first frame by more than a grasp explains.
             UnfamiliarFrameError: Part of the image lost its fine detail: something covers or blurs the view, or the
                 object that was there is gone. Its force is NaN.
         """
-        pixels = small.astype(np.float32)
+        pixels = image.astype(np.float32)
         brightness, contrast = (float(value.item()) for value in cv2.meanStdDev(pixels))
         if contrast < FLAT_STD:
             raise DataError(
                 f"the camera's image is flat (gray level {brightness:.0f}); check its lens, light and exposure"
             )
         steps = cv2.norm(pixels[:, 1:], pixels[:, :-1], cv2.NORM_L1) / pixels[:, 1:].size
-        present = brightness, contrast, steps / contrast
-        if self._first is None:
-            self._first = present
+        values = brightness, contrast, steps / contrast
+        if self._first_values is None:
+            self._first_values = values
             if len(pixels) >= _MIN_PX:
                 self._set_first_frame(pixels)
-        for (name, most), now, first in zip(MAX_RATIOS.items(), present, self._first, strict=True):
-            if not first / most <= now <= first * most:
+        for (name, limit), present, first in zip(MAX_RATIOS.items(), values, self._first_values, strict=True):
+            if not first / limit <= present <= first * limit:
                 raise DataError(
-                    f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
+                    f"the image's {name} changed from {first:.3g} to {present:.3g} since the first frame; check "
                     "the camera and the light"
                 )
         changes = self.changes(pixels) if len(pixels) >= _MIN_PX else {}
-        exceeded = {name: cause for name, (change, most, cause) in changes.items() if change > most}
+        exceeded = {name: cause for name, (change, limit, cause) in changes.items() if change > limit}
         if exceeded:
             cause = next(iter(exceeded.values()))
             problem = f"{cause} since the first frame; check the camera, its lens and the light"
@@ -139,20 +139,20 @@ class FrameChecks:
         shift, zoom = float(np.hypot(*change[:2])), float(abs(change[2]))
         if still.mean() < _FEW_STILL:
             shift = max(shift, self._large_shift(smooth))
-        slope = float(np.hypot(*change[5:])) / self._first[0] if self._first else 0.0
+        slope = float(np.hypot(*change[5:])) / self._first_values[0] if self._first_values else 0.0
         detail = _block_means(np.square(cv2.Laplacian(smooth, cv2.CV_32F)))
         ratio = (detail + _DETAIL_NOISE) / (self._detail + _DETAIL_NOISE)
-        kept = ratio[_block_means(still.reshape(_SAMPLED_SIDE, -1).astype(np.float32)) > 0.7]
-        blur = 1 - median(kept.tolist()) if len(kept) else 0.0
+        still_ratios = ratio[_block_means(still.reshape(_SAMPLED_SIDE, -1).astype(np.float32)) > 0.7]
+        blur = 1 - median(still_ratios.tolist()) if len(still_ratios) else 0.0
         covered = float((ratio < 0.3).mean())
-        light = f"the light changed by {slope:.0%} more at one side than in the middle"
-        hidden = f"{covered:.0%} of the image lost its detail, as if it was covered, over vision.max_covered,"
+        light_text = f"the light changed by {slope:.0%} more at one side than in the middle"
+        cover = f"{covered:.0%} of the image lost its detail, as if it was covered, over vision.max_covered,"
         return {
             "shift": (shift, MAX_SHIFT, f"the camera's view moved by {shift:.1%} of its side"),
             "zoom": (zoom, MAX_ZOOM, f"the camera's view was zoomed by {zoom:.1%}"),
-            "slope": (slope, MAX_SLOPE, light),
+            "slope": (slope, MAX_SLOPE, light_text),
             "blur": (blur, MAX_BLUR, f"the image lost {blur:.0%} of its fine detail"),
-            "covered": (covered, self._max_covered, hidden),
+            "covered": (covered, self._max_covered, cover),
         }
 
     def _large_shift(self, smooth: Floats) -> float:
@@ -169,7 +169,7 @@ class FrameChecks:
         return float(np.hypot(right, down)) / side if explained > _EXPLAINED else 0.0
 
     def _explained(self, difference: Floats) -> float:
-        """Returns the share of the pixels that differ by the same, but for noise."""
+        """Returns the share of the pixels whose difference is the median, apart from noise."""
         sampled = difference.take(self._sampled)
         return float((np.abs(sampled - np.median(sampled)) < _STILL_LEVELS).mean())
 
@@ -179,15 +179,15 @@ class FrameChecks:
         self._detail = _block_means(np.square(cv2.Laplacian(self._smooth, cv2.CV_32F)))
         side = len(pixels)
         self._window = cv2.createHanningWindow((side, side), cv2.CV_32F)
-        along = ((np.arange(_SAMPLED_SIDE) + 0.5) * side / _SAMPLED_SIDE).astype(int)
-        self._sampled = (along[:, None] * side + along).ravel()  # (N,), indices of evenly spaced pixels
+        points = ((np.arange(_SAMPLED_SIDE) + 0.5) * side / _SAMPLED_SIDE).astype(int)
+        self._sampled = (points[:, None] * side + points).ravel()  # (N,), indices of evenly spaced pixels
         y, x = np.meshgrid(*[np.linspace(-1, 1, side, dtype=np.float32)] * 2, indexing="ij")
         # Gray levels per shift by one side, and per zoom about the middle.
         right, down = (cv2.Sobel(self._smooth, cv2.CV_32F, dx, 1 - dx, scale=-side / 8) for dx in (1, 0))
         zoom = (right * x + down * y) / 2
         ones, zeros = np.ones_like(x), np.zeros_like(x)  # each frame replaces the zeros by its difference
-        parts = (right, down, zoom, ones, self._smooth - self._smooth.mean(), x, y, zeros)
-        self._fitted = np.stack([part.take(self._sampled) for part in parts])  # (8, N)
+        directions = (right, down, zoom, ones, self._smooth - self._smooth.mean(), x, y, zeros)
+        self._fitted = np.stack([direction.take(self._sampled) for direction in directions])  # (8, N)
         # A new array for each step would take longer than the step.
         self._weighted = np.empty_like(self._fitted[:-1])
         # A direction that no texture shows stays at zero.

@@ -15,7 +15,7 @@ from gripper_force.vision.header import GaussianProcessConfig
 from gripper_force.vision.network import Output
 
 FAINT: Final = 0.04
-"""Changes of a pooled frame up to this one count linearly, larger ones logarithmically."""
+"""Changes of a pooled frame up to this size count linearly, larger ones logarithmically."""
 
 
 class GaussianProcess(nn.Module):

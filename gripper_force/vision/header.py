@@ -232,8 +232,8 @@ class Header(Section):
 
     def mismatches(self, rig: Tree) -> list[str]:
         """Returns the differences between the one rig of the training set and a run's settings, as text."""
-        known = self.trained_on or {}
-        return differences(known, rig) if known.get("rigs") == 1 else []
+        training_rig = self.trained_on or {}
+        return differences(training_rig, rig) if training_rig.get("rigs") == 1 else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,15 +289,15 @@ def read_checkpoint(source: str | Path) -> tuple[Path, bytes, Header]:
     return path, data, header_from(metadata[FORMAT], path)
 
 
-def header_from(text: str, path: Path) -> Header:
+def header_from(json_text: str, path: Path) -> Header:
     """Reads a header's JSON. Raises `CheckpointError` that names ``path``."""
     try:
-        return Header.model_validate_json(text)
+        return Header.model_validate_json(json_text)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        problem = error.errors()[0]
+        key = ".".join(str(part) for part in problem["loc"])
         raise CheckpointError(
-            f"the header of {path} is invalid at {key!r}: {first['msg']}; train the network again"
+            f"the header of {path} is invalid at {key!r}: {problem['msg']}; train the network again"
         ) from error
 
 

@@ -25,7 +25,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def describe_view(reference: Gray) -> Floats:
-    """Returns the description of a reference image (S, S), (`VIEW_LENGTH`,)."""
+    """Returns the description, (`VIEW_LENGTH`,), of a reference image (S, S)."""
     window, block, step, cell = [(side, side) for side in _SIDES]
     hog = cv2.HOGDescriptor(window, block, step, cell, _DIRECTIONS, _signedGradient=True)
     image = cv2.resize(reference, window, interpolation=cv2.INTER_AREA)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from gripper_force.errors import CheckpointError
-from gripper_force.folders import own_folder
+from gripper_force.folders import xdg_folder
 from gripper_force.vision.header import (
     EXPORTED,
     KEY,
@@ -88,7 +88,7 @@ def unusable(engine: str, path: Path, model: Model, error: Exception) -> Checkpo
 
 def check_weights(path: Path) -> None:
     """Raises `ValueError` if the weights beside an OpenVINO file are not those that it was exported with."""
-    if _openvino_metadata(path).get(WEIGHTS, found := weights_digest(path)) != found:
+    if _openvino_metadata(path).get(WEIGHTS, digest := weights_digest(path)) != digest:
         raise ValueError(f"{path.with_suffix('.bin').name} does not hold the weights of this file")
 
 
@@ -105,7 +105,7 @@ def exported_name(model: Model, suffix: str) -> str:
 
 def cache_folder() -> Path:
     """Returns the folder of cached files. Raises `ConfigError` if there is none."""
-    return own_folder("XDG_CACHE_HOME", ".cache")
+    return xdg_folder("XDG_CACHE_HOME", ".cache")
 
 
 def _openvino_metadata(path: Path) -> dict[str, str]:

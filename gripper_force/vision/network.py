@@ -147,12 +147,12 @@ class ForceNetwork(nn.Module):
         windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
         return self._head(windows.flatten(0, 1)).view(batch, length - start, -1)
 
-    def pooled(self, clips: Tensor, earlier: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+    def pooled(self, clips: Tensor, earlier_maps: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Computes each frame's map after attention, averaged.
 
         Args:
             clips: As for `forward`.
-            earlier: Maps of the frames before the clips, which the last call returned; None at their beginning.
+            earlier_maps: Maps of the frames before the clips, which the last call returned; None at their beginning.
 
         Returns:
             The averages, (B, T, C), and the maps of the last frames, (B, n, C, H, W), None without earlier frames.
@@ -162,12 +162,12 @@ class ForceNetwork(nn.Module):
         maps = flat.view(batch, length, *flat.shape[1:])
         stack = flat
         if n := self.config.maps_kept:
-            if earlier is None:
-                earlier = maps[:, :1].expand(-1, n, -1, -1, -1)
-            padded = torch.cat([earlier, maps], dim=1)  # (B, n + T, C, H, W)
-            earlier = padded[:, length:]
+            if earlier_maps is None:
+                earlier_maps = maps[:, :1].expand(-1, n, -1, -1, -1)
+            padded = torch.cat([earlier_maps, maps], dim=1)  # (B, n + T, C, H, W)
+            earlier_maps = padded[:, length:]
             stack = torch.cat([padded[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
-        return self._pool(stack, flat)[0].view(batch, length, -1), earlier
+        return self._pool(stack, flat)[0].view(batch, length, -1), earlier_maps
 
     def force_n(self, features: Tensor) -> Tensor:
         """Applies the last layer: features (N, head) to forces in N, (N,)."""
@@ -196,15 +196,15 @@ class ForceNetwork(nn.Module):
             for _ in range(self.config.context):
                 _, state = self.step(frame, state)
         newest = self.backbone(frame)  # (B, C, H, W)
-        stack, kept = newest, state.maps
+        stack, next_maps = newest, state.maps
         if n := self.config.maps_kept:
             stack = torch.cat([state.maps, newest], dim=1)  # (B, (n+1)*C, H, W)
             # Slicing takes engines as long as a layer, so it is avoided for n = 1.
-            kept = newest if n == 1 else stack[:, newest.shape[1] :]
+            next_maps = newest if n == 1 else stack[:, newest.shape[1] :]
         pooled, gates = self._pool(stack, newest)
         output, hidden, cell = self.blstm.advance(pooled, state.hidden, state.cell)
         features = torch.tanh(self.dense(output))
-        return Output(self.force_n(features), features, gates), StreamState(kept, hidden, cell)
+        return Output(self.force_n(features), features, gates), StreamState(next_maps, hidden, cell)
 
     def zero_state(self, batch: int = 1) -> StreamState:
         """Returns a state of zeros. It affects the outputs of `NetworkConfig.context` steps."""

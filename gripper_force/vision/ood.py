@@ -26,8 +26,8 @@ FRAMES: Final = 20
 def distance2(deviation: Floats, axes: npt.NDArray[np.floating]) -> Floats:
     """Returns the squared distances from a subspace, (N,), of deviations (N, F) from its mean, for its basis (F, R)."""
     # The difference of the two squares would cancel: a known frame is within a thousandth of the subspace.
-    found: Floats = np.square(deviation - (deviation @ axes) @ axes.T).sum(1)
-    return found
+    squared: Floats = np.square(deviation - (deviation @ axes) @ axes.T).sum(1)
+    return squared
 
 
 def residual_share(

@@ -70,18 +70,18 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
         ConfigError: The region is not four whole numbers, or reaches beyond the frame.
     """
     if not isinstance(gray, np.ndarray) or gray.ndim != 2 or gray.dtype != np.uint8:
-        found = f"{gray.shape} {gray.dtype}" if isinstance(gray, np.ndarray) else type(gray).__name__
-        raise DataError(f"the frame is {found}, not (H, W) uint8; convert it to a gray image of bytes")
+        actual = f"{gray.shape} {gray.dtype}" if isinstance(gray, np.ndarray) else type(gray).__name__
+        raise DataError(f"the frame is {actual}, not (H, W) uint8; convert it to a gray image of bytes")
     if not gray.size:
         raise DataError("the frame has no pixels; check the camera")
     if region is not None:
-        given = np.ravel(region)
-        is_whole = given.shape == (4,) and given.dtype.kind in "iu"
-        left, top, width, height = given.tolist() if is_whole else (-1, 0, 0, 0)
+        values = np.ravel(region)
+        is_whole = values.shape == (4,) and values.dtype.kind in "iu"
+        left, top, width, height = values.tolist() if is_whole else (-1, 0, 0, 0)
         rows, columns = gray.shape
         if not (0 <= left < left + width <= columns and 0 <= top < top + height <= rows):
             raise ConfigError(
-                f"vision.region {given.tolist()} (left, top, width, height in whole pixels) must lie within "
+                f"vision.region {values.tolist()} (left, top, width, height in whole pixels) must lie within "
                 f"the camera's frame of {columns}x{rows} pixels"
             )
         gray = gray[top : top + height, left : left + width]
@@ -134,7 +134,7 @@ class Normaliser:
         return np.abs(difference) if self._preprocess.magnitude else difference
 
 
-def _standardise(small: Gray) -> npt.NDArray[np.float32]:
-    image = small.astype(np.float32)
+def _standardise(gray: Gray) -> npt.NDArray[np.float32]:
+    image = gray.astype(np.float32)
     standardised: npt.NDArray[np.float32] = (image - image.mean()) / np.float32(max(image.std(), FLAT_STD))
     return standardised

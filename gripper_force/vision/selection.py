@@ -45,9 +45,9 @@ def resolve_auto(
             f"no installed engine runs vision.checkpoint={vision.checkpoint} with vision.engine={vision.engine} and "
             f"vision.precision={vision.precision}; pip install 'gripper-force[engines]', or set other values"
         )
-    chosen, sentence = select(tested, budget)
+    choice, sentence = select(tested, budget)
     keys = ("checkpoint", "engine", "precision", "threads")
-    return vision.model_copy(update={key: getattr(chosen, key) for key in keys}), sentence
+    return vision.model_copy(update={key: getattr(choice, key) for key in keys}), sentence
 
 
 def select(tested: Sequence[EngineCandidate], budget: BudgetConfig) -> tuple[EngineCandidate, str]:
@@ -59,22 +59,22 @@ def select(tested: Sequence[EngineCandidate], budget: BudgetConfig) -> tuple[Eng
         ConfigError: No candidate keeps the budget.
     """
     limits = f"budget.latency_ms={budget.latency_ms}, budget.error_n={budget.error_n}"
-    within = [
+    allowed = [
         candidate
         for candidate in tested
         if (budget.latency_ms is None or candidate.p99_ms <= budget.latency_ms)
         and (budget.error_n is None or candidate.error_n <= budget.error_n)
     ]
-    if not within:
+    if not allowed:
         front = "; ".join(str(candidate) for candidate in pareto_front(tested))
         raise ConfigError(f"no network and engine keep {limits}; raise the budget, the best are: {front}")
     if budget.latency_ms is None and budget.error_n is None:
-        chosen = min(within, key=lambda candidate: (candidate.error_n, candidate.p50_ms))
+        choice = min(allowed, key=lambda candidate: (candidate.error_n, candidate.p50_ms))
         reason = "the fastest of the most accurate"
     else:
-        chosen = min(within, key=lambda candidate: candidate.cost_ms)
+        choice = min(allowed, key=lambda candidate: candidate.cost_ms)
         reason = f"the cheapest that keeps {limits}"
-    return chosen, f"chose {chosen} ({reason} of {len(tested)} candidates)"
+    return choice, f"chose {choice} ({reason} of {len(tested)} candidates)"
 
 
 def pareto_front(tested: Sequence[EngineCandidate]) -> list[EngineCandidate]:
@@ -94,22 +94,22 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Engin
         set_threads: Measures PyTorch with several thread counts. They are one setting of the whole process,
             which is restored afterwards. Otherwise PyTorch is measured with the present setting only.
     """
-    known = read_cache()
-    found = []
+    cached = read_cache()
+    result = []
     for model, engine, precision, threads in _settings(vision, set_threads):
         key = cache_key(model, engine, precision, threads)
         error_n = model.header.metrics.get("mae_n", float("inf"))
-        if key not in known:
+        if key not in cached:
             keeps_threads = engine == "torch" and not set_threads
             with _restored_threads(engine):
                 opened = open_engine(model, engine, precision, None if keeps_threads else threads)
                 p50_ms, p99_ms = step_times_ms(opened)
-            known[key] = EngineCandidate(_name(model), engine, precision, threads, p50_ms, p99_ms, error_n)
+            cached[key] = EngineCandidate(_name(model), engine, precision, threads, p50_ms, p99_ms, error_n)
             if engine_version(engine):  # without a version, a measurement could outlive an update
-                update_cache({key: known[key]})
+                update_cache({key: cached[key]})
         # The file and its stated error can change without the digest, so they are not taken from the cache.
-        found.append(replace(known[key], checkpoint=_name(model), error_n=error_n))
-    return found
+        result.append(replace(cached[key], checkpoint=_name(model), error_n=error_n))
+    return result
 
 
 def installed() -> list[str]:

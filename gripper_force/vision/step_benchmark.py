@@ -70,12 +70,12 @@ def step_times_ms(engine: Engine) -> tuple[float, float]:
     """
     size = engine.header.preprocess.size
     frames = np.random.default_rng(0).normal(size=(8, size, size)).astype(np.float32)
-    taken_ns = []
+    times_ns = []
     for i in range(_STEPS + _WARM_UP_STEPS):
         begin_ns = time.perf_counter_ns()
         engine.step(frames[i % len(frames)])
-        taken_ns.append(time.perf_counter_ns() - begin_ns)
-    p50_ns, p99_ns = np.percentile(taken_ns[_WARM_UP_STEPS:], [50, 99])
+        times_ns.append(time.perf_counter_ns() - begin_ns)
+    p50_ns, p99_ns = np.percentile(times_ns[_WARM_UP_STEPS:], [50, 99])
     return float(p50_ns / NS_PER_MS), float(p99_ns / NS_PER_MS)
 
 
@@ -105,19 +105,19 @@ def cache_key(model: Model, engine: str, precision: str, threads: int) -> str:
 
 def read_cache() -> dict[str, EngineCandidate]:
     """Returns the measurements of this machine by `cache_key`; a malformed line of the file is left out."""
-    known = {}
+    cached = {}
     with suppress(OSError):
         for line in _cache_file().read_text(encoding="utf-8", errors="replace").splitlines():
             with suppress(ValueError, TypeError):
                 key, candidate = json.loads(line)
-                known[key] = EngineCandidate(**candidate)
-    return known
+                cached[key] = EngineCandidate(**candidate)
+    return cached
 
 
-def update_cache(measured: dict[str, EngineCandidate]) -> None:
+def update_cache(measurements: dict[str, EngineCandidate]) -> None:
     """Adds measurements to the cache, one line each, so that no process replaces another's; nothing if it can't."""
     # An interruption may have cut the last line.
-    lines = ["\n" + json.dumps([key, asdict(candidate)]) for key, candidate in measured.items()]
+    lines = ["\n" + json.dumps([key, asdict(candidate)]) for key, candidate in measurements.items()]
     with suppress(OSError):
         _cache_file().parent.mkdir(parents=True, exist_ok=True)
         with _cache_file().open("a", encoding="utf-8") as file:

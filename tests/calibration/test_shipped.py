@@ -18,5 +18,5 @@ def test_shipped_profiles_match_the_shipped_network_and_the_default_camera(
     config = load_config(None, [f"object={name}", "calibration.object=own"])
     correction = read_correction(config, read_profiles(config), load_checkpoint())
     assert correction is not None
-    assert correction.differs == ()
+    assert correction.mismatches == ()
     assert correction.profile.force_n > 8

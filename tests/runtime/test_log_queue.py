@@ -82,7 +82,7 @@ def test_a_disk_that_fails_is_told_at_the_end(gate: Gate, lockstep: bool) -> Non
 def test_a_slow_disk_keeps_nobody_waiting(gate: Gate, path: Path) -> None:
     gate.opened.clear()
     log_queue = LogQueue(gate, lockstep=False)  # type: ignore[arg-type]
-    for event in events(recorder_module.ROOM + 100):
+    for event in events(recorder_module.CAPACITY + 100):
         log_queue.write(event)  # returns, though the disk does not
     assert 99 <= log_queue.lost <= 100
     gate.opened.set()
@@ -90,14 +90,14 @@ def test_a_slow_disk_keeps_nobody_waiting(gate: Gate, path: Path) -> None:
     with pytest.raises(LogError, match="the disk is too slow"):
         log_queue.raise_losses()
     written = list(LogReader(path).records(Event))
-    sent = events(recorder_module.ROOM + 100)
+    sent = events(recorder_module.CAPACITY + 100)
     # The thread holds one record beyond the queue's room, and may have taken it at any time meanwhile.
-    assert written[: recorder_module.ROOM] == sent[: recorder_module.ROOM]
-    assert all(event in sent[recorder_module.ROOM :] for event in written[recorder_module.ROOM :])
-    assert len(written) + log_queue.lost == recorder_module.ROOM + 100
+    assert written[: recorder_module.CAPACITY] == sent[: recorder_module.CAPACITY]
+    assert all(event in sent[recorder_module.CAPACITY :] for event in written[recorder_module.CAPACITY :])
+    assert len(written) + log_queue.lost == recorder_module.CAPACITY + 100
 
 
-@pytest.mark.parametrize("count", [1, recorder_module.ROOM + 100])
+@pytest.mark.parametrize("count", [1, recorder_module.CAPACITY + 100])
 def test_a_disk_that_hangs_does_not_keep_the_run_from_ending(
     gate: Gate, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:

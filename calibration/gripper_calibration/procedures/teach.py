@@ -39,7 +39,7 @@ from gripper_calibration.touch_logs import join, read_log, started_ns
 from gripper_force.config import Config, config_from_text
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import CONTACT_N, StreamedClip, find_logs, load_clips, starts_in_contact
-from gripper_force.jobs.profile_files import check_place, pack, write_object
+from gripper_force.jobs.profile_files import check_writable, pack, write_object
 from gripper_force.jobs.recording.record import check_name
 from gripper_force.jobs.training.ood_fit import model_of_scores
 from gripper_force.jobs.training.stated_errors import errors, residuals
@@ -214,7 +214,7 @@ def check_before_touches(config: Config, name: str, out: Path) -> tuple[Config, 
             f"the bundle {out} is that of the object in {other}, not of {file}; rename one of the files, or name "
             "another folder with --out"
         )
-    check_place(out.with_name(f"{out.name}.yaml"))
+    check_writable(out.with_name(f"{out.name}.yaml"))
     config, model, _ = resolve_vision(config)
     if model is None:
         raise ConfigError("teach needs a network to begin with; set vision.checkpoint, such as to default")

@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 from gripper_calibration.setup.step import ANSWERED, Found
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
-from gripper_force.jobs.profile_files import check_place, write_all
+from gripper_force.jobs.profile_files import check_writable, write_all
 from gripper_force.schema import Tree, assign, assign_value, read_tree, to_yaml
 
 FORMAT: Final = "gripper-force-setup/1"
@@ -158,10 +158,10 @@ class RigFile:
         self.steps = {one: self.steps[one] for one in (*order, *self.steps) if one in self.steps}
         self.write()
 
-    def check_place(self) -> None:
+    def check_writable(self) -> None:
         """Raises `ConfigError` if the rig file or the state can't be written."""
         for path in (self.path, self._state):
-            check_place(path)
+            check_writable(path)
 
     def write(self) -> None:
         """Writes the rig file and the state.

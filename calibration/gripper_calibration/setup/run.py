@@ -194,7 +194,7 @@ class Setup:
                     yield self._kept(name)
                     continue
                 person.tell(f"{name} runs again, because these changed: {', '.join(changed)}")
-            self.rig.check_place()  # before the step writes to the servo
+            self.rig.check_writable()  # before the step writes to the servo
             person.tell(f"[{number} of {len(STEPS)}] {name}: {step.title}")
             self.rig.forget(name)
             task = Task(

@@ -18,7 +18,7 @@ from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.checkpoint_writer import check_place, replace_header
+from gripper_force.vision.checkpoint_writer import check_writable, replace_header
 from gripper_force.vision.estimator import claimed_std_n
 from gripper_force.vision.header import Header, KnownViews, OodModel, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
@@ -172,7 +172,7 @@ def calibrate_network(
         LogError: A log can't be read.
         CheckpointError: The checkpoint can't be read or written.
     """
-    check_place(out)
+    check_writable(out)
     checkpoint = load_checkpoint(source)
     networks = checkpoint.force_networks  # raises for a Gaussian process, before the logs are read
     preprocess = checkpoint.header.preprocess

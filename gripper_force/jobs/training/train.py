@@ -30,7 +30,7 @@ from gripper_force.jobs.training.view_fit import fit_views
 from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
-from gripper_force.vision.checkpoint_writer import check_place, save_checkpoint
+from gripper_force.vision.checkpoint_writer import check_writable, save_checkpoint
 from gripper_force.vision.header import Header, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 
@@ -90,7 +90,7 @@ def train(
         ConfigError: The recipe sets a key in which ``init`` differs, ``init`` or ``replay_clips`` are given for
             a Gaussian process, or the processes can't train together, for example because their recipes differ.
     """
-    check_place(out)
+    check_writable(out)
     if not clips or (validation_clips is not None and not validation_clips):
         use = "validate with" if clips else "train on"
         raise DataError(f"no recording is left to {use}; add logs, or hold out fewer objects")

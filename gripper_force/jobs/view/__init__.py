@@ -80,12 +80,12 @@ class GrowingLog(LogReader):
         except LogError:
             if not path.exists():  # a run without a cycle deletes it
                 return False
-            if not self._scanned or self.complete or path.stat().st_size > _HEAD_BYTES:
+            if not self._scan_end or self.complete or path.stat().st_size > _HEAD_BYTES:
                 raise
             return False
         return True
 
-    def _each_chunk(self) -> Iterator[Any]:
+    def _chunks_to_read(self) -> Iterator[Any]:
         shown = 0
         while True:
             new = self._chunks[shown:]

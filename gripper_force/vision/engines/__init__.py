@@ -59,11 +59,11 @@ class Engine(ABC):
 
     def __init__(self, header: Header) -> None:
         self.header = header
-        self._begun = False
+        self._has_begun = False
 
     def reset(self) -> None:
         """Forgets all frames; the next one is the first of a new stream."""
-        self._begun = False
+        self._has_begun = False
 
     def warm_up(self) -> None:
         """Runs the networks once, so that the first step of a stream is as fast as the others."""
@@ -83,12 +83,12 @@ class Engine(ABC):
         # OpenVINO's ReLU maps NaN to 0, so the result would look like any other force.
         if not np.isfinite(frame).all():
             raise NonFiniteError("a prepared frame holds NaN or infinity; check the camera's image")
-        if not self._begun:
+        if not self._has_begun:
             # Frames before the first count as copies of the first.
             self._zero_states()
             for _ in range(max(member.context for member in self.header.members)):
                 self._infer(frame)
-            self._begun = True
+            self._has_begun = True
         return self._infer(frame)
 
     @abstractmethod
@@ -125,7 +125,7 @@ def open_engine(
         raise ConfigError(f"vision.threads {threads!r} is not a whole number from 1 on; name one, or None")
     if precision != "float32" and engine in ENGINES and engine != "openvino":
         raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
-    other = "" if engine == "onnxruntime" else ", or set vision.engine=onnxruntime"
-    opened: Engine = load_class("engines", ENGINES, engine, "vision.engine", other)(model, precision, threads)
+    hint = "" if engine == "onnxruntime" else ", or set vision.engine=onnxruntime"
+    opened: Engine = load_class("engines", ENGINES, engine, "vision.engine", hint)(model, precision, threads)
     opened.warm_up()
     return opened

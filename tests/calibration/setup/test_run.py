@@ -175,7 +175,7 @@ def test_a_finished_setup_is_shown_from_a_place_that_can_not_be_written(
     def refuse(_: RigFile) -> None:
         raise ConfigError("can't write")
 
-    monkeypatch.setattr(RigFile, "check_place", refuse)
+    monkeypatch.setattr(RigFile, "check_writable", refuse)
     assert [report.result for report in Setup(path).run(Script())] == 6 * ["kept"]
 
 
