@@ -91,13 +91,13 @@ def estimator(
     with TemporaryDirectory() as name:
         if data is None or scale_on is None:
             data, scale_on = _simulate_presses(Path(name), settings, jobs)
-        with console.bar_or_lines("measuring", estimator_bench.count_steps(sources, counts)) as measured:
+        with console.bar_or_lines("measuring", estimator_bench.count_steps(sources, counts)) as progress:
             rows = estimator_bench.bench(
                 sources,
                 lambda model: _load(data, jobs, model.header.preprocess),
                 lambda model: _load(scale_on, jobs, model.header.preprocess),
                 counts,
-                measured,
+                progress,
             )
     plot = folder / "estimator.png" if write is None else write.with_suffix(".png")
     file = folder / "estimator.json"
@@ -122,9 +122,9 @@ def _simulate_presses(folder: Path, settings: "Config", workers: int) -> tuple[P
     from gripper_force.jobs.simulate import plan, simulate
 
     data, scale_on = folder / "data", folder / "scale"
-    made = ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000)))
-    with console.bar("simulating", sum(len(plans) for _, plans in made)) as progress:
-        for logs, plans in made:
+    jobs = ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000)))
+    with console.bar("simulating", sum(len(plans) for _, plans in jobs)) as progress:
+        for logs, plans in jobs:
             for path in simulate(plans, logs, settings, workers):
                 progress(path.name)
     return data, scale_on
@@ -209,21 +209,21 @@ def teach(
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_hw.sim.kinds import held_out_kinds
 
-    if strange := sorted(set(methods or ()) - set(job.METHODS)):
-        raise ConfigError(f"no method {strange[0]!r}; use one of {', '.join(job.METHODS)}")
+    if unknown := sorted(set(methods or ()) - set(job.METHODS)):
+        raise ConfigError(f"no method {unknown[0]!r}; use one of {', '.join(job.METHODS)}")
     rows: list[job.Cell] = []
     real: list[job.RecordingRow] = []
     if recordings is not None:
         with console.err.status("teaching") as status:
-            for found in job.bench_recordings(recordings, folder, console.status_text(status)):
-                real.append(found)
-                console.line(f"{found.object}, {found.trials} trials: {found.taught_n:.2f} N")
+            for recording in job.bench_recordings(recordings, folder, console.status_text(status)):
+                real.append(recording)
+                console.line(f"{recording.object}, {recording.trials} trials: {recording.taught_n:.2f} N")
         text = job.recordings_markdown(real)
     else:
         settings = load_settings(None, set_, {})
-        chosen = job.read_rigs(rigs, set_) if rigs else job.foreign_rigs(settings, drawn)
-        counts, used = touches or job.COUNTS, methods or job.METHODS
-        cells = job.list_cells(chosen, objects or held_out_kinds(), counts, used)
+        rig_list = job.read_rigs(rigs, set_) if rigs else job.foreign_rigs(settings, drawn)
+        counts, method_list = touches or job.COUNTS, methods or job.METHODS
+        cells = job.list_cells(rig_list, objects or held_out_kinds(), counts, method_list)
         with console.bar("teaching", len(cells)) as progress:
             running = job.bench(
                 cells,
@@ -240,8 +240,8 @@ def teach(
         text = job.markdown(rows)
     if write is not None:
         write_between(write, "teach" if recordings is None else "teach recordings", text)
-    shown = {"cells": rows} if recordings is None else {"recordings": [row._asdict() for row in real]}
-    _show(shown, as_json, lambda: console.out.print(text, soft_wrap=True))
+    report = {"cells": rows} if recordings is None else {"recordings": [row._asdict() for row in real]}
+    _show(report, as_json, lambda: console.out.print(text, soft_wrap=True))
 
 
 @app.command("bus")
@@ -292,7 +292,7 @@ def replay(
             "--checkpoint", help="Checkpoint, by path or name. Repeatable. Default: default and small."
         ),
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds, in each of which all ways take turns.")] = 2,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; each one measures every row once.")] = 2,
     jobs: Jobs = CORES,
     write: Page = None,
     set_: NoOverrides = None,
@@ -312,12 +312,12 @@ def replay(
         if logs is None:
             logs = Path(name) / "logs"
             with console.bar("simulating", presses) as progress:
-                for made in simulate(plan("press", presses, 900_000), logs, load_config(None, None), jobs):
-                    progress(made.name)
+                for path in simulate(plan("press", presses, 900_000), logs, load_config(None, None), jobs):
+                    progress(path.name)
         count = len(find_logs(logs))
         rows = replay_bench.bench(logs, checkpoints or ["default", "small"], jobs, rounds, console.line)
-    repeated = "one round" if rounds == 1 else f"median of {rounds} rounds"
-    about = f"{count} logs, {repeated}, {CORES} cores, load {load:.1f} before the first command."
+    rounds_text = "one round" if rounds == 1 else f"median of {rounds} rounds"
+    about = f"{count} logs, {rounds_text}, {CORES} cores, load {load:.1f} before the first command."
     text = replay_bench.markdown(rows, about)
     if write is not None:
         write_between(write, "rates", text)
@@ -450,8 +450,8 @@ def checkpoints(
                 load_clips(logs, preprocess, workers=jobs, progress=progress), preprocess
             )
 
-    found = state_errors(checkpoint, read, write=write)
-    _show({"checkpoints": found}, as_json, lambda: checkpoints_table(found))
+    errors = state_errors(checkpoint, read, write=write)
+    _show({"checkpoints": errors}, as_json, lambda: checkpoints_table(errors))
 
 
 def _show(result: Mapping[str, object], as_json: bool, table: Callable[[], None]) -> None:

@@ -15,7 +15,7 @@ from gripper_force.cli.options import (
     Jobs,
     NoOverrides,
     Overrides,
-    again,
+    config_options,
     load_settings,
     load_settings_before_rig,
 )
@@ -195,8 +195,8 @@ def weight(
             f"gripper.friction_n contradicts the breakaway friction of {result.breakaway_n:.2f} N; measure it with "
             "`calibrate jaws`"
         )
-    found = [f"gripper.{key}={value:.4g}" for key, value in result.settings.items()]
-    _next_step(["grasp"], config, [*(set_ or []), *found])
+    overrides = [f"gripper.{key}={value:.4g}" for key, value in result.settings.items()]
+    _next_step(["grasp"], config, [*(set_ or []), *overrides])
 
 
 @app.command("camera")
@@ -278,7 +278,7 @@ def object_(
         _refuse_recording(touches=touches, peak_n=peak_n, folder=folder, fresh=fresh, pause=pause)
     touches = touches or job.TOUCHES
     settings = load_settings(config, set_, {"object": name, "seed": seed})
-    given, name = name, settings.object  # a path has become a name
+    argument, name = name, settings.object  # a path has become a name
     folder = folder or job.default_folder(name)
     prepared = job.prepare(settings, name, out)
     if logs is None:
@@ -296,9 +296,9 @@ def object_(
             f"{job.TOUCHES} are recommended",
             soft_wrap=True,
         )
-    if out is None and (found := find_object(name)) != result.profile_path:
+    if out is None and (path := find_object(name)) != result.profile_path:
         console.warn(
-            f"runs use the bundle {found.parent} instead, which `teach` made; pass --profile {result.profile_path} to "
+            f"runs use the bundle {path.parent} instead, which `teach` made; pass --profile {result.profile_path} to "
             "use this profile, or delete the bundle"
         )
     console.show(result.as_dict(), as_json, lambda _: output.object_table(result))
@@ -306,7 +306,7 @@ def object_(
     words = [
         "grasp",
         "--object",
-        given,
+        argument,
         "--profile",
         str(profile),
         *_safe_target(result.profile),
@@ -332,8 +332,8 @@ def network(
     logs = find_logs(data)
     with console.bar("calibrating", 2 * len(logs)) as progress:
         model, views = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
-    fitted = model.model_dump(mode="json", exclude={"mean", "axes"})
-    result = {"checkpoint": str(out), **fitted, "view_limit": None if views is None else views.limit}
+    values = model.model_dump(mode="json", exclude={"mean", "axes"})
+    result = {"checkpoint": str(out), **values, "view_limit": None if views is None else views.limit}
     console.show(result, as_json, lambda _: output.network_table(str(out), model, views))
     console.next_step("evaluate", data, "--checkpoint", out)
 
@@ -361,10 +361,10 @@ def gain(
 
     paths = find_logs(logs)
     _tell_other_objects(read_object(find_object(name)).object, paths)
-    saved = save_gain(name, paths, out, set_)
-    console.show(saved, as_json, output.gain_table)
-    target = _safe_target(read_object(saved.profile))
-    console.next_step("grasp", "--object", saved.object, "--profile", out or name, *target)
+    result = save_gain(name, paths, out, set_)
+    console.show(result, as_json, output.gain_table)
+    target = _safe_target(read_object(result.profile))
+    console.next_step("grasp", "--object", result.object, "--profile", out or name, *target)
 
 
 def teach(
@@ -419,7 +419,7 @@ def teach(
         _refuse_recording(touches=touches, peak_n=peak_n, fresh=fresh, pause=pause)
     touches = touches or job.TOUCHES
     settings = load_settings(config, set_, {"object": name, "seed": seed})
-    given, name = name, settings.object  # a path has become a name
+    argument, name = name, settings.object  # a path has become a name
     folder = folder or calibrate_object.default_folder(name)
     job.check_before_touches(settings, name, out or user_folder() / name)
     begin_s = time.monotonic()
@@ -442,30 +442,30 @@ def teach(
                 progress=progress,
             )
     except KeyboardInterrupt:
-        console.tell_kept(f"what was done until now is in {folder}", fresh=fresh)
+        console.tell_resumable(f"what was done until now is in {folder}", fresh=fresh)
         raise
     _tell_left_out(result)
-    shown = console.jsonable(result) | {"minutes": (time.monotonic() - begin_s) / 60}
-    console.show(shown, as_json, lambda _: output.taught_table(result, shown["minutes"]))
+    row = console.jsonable(result) | {"minutes": (time.monotonic() - begin_s) / 60}
+    console.show(row, as_json, lambda _: output.taught_table(result, row["minutes"]))
     if result.more_touches_help:
         console.err.print(
             f"more touches would reduce the error further: --touches {2 * len(result.profile.logs)} adds to these",
             soft_wrap=True,
         )
-    words = ["grasp", "--object", given, *_safe_target(result.profile)]
+    words = ["grasp", "--object", argument, *_safe_target(result.profile)]
     words += [] if out is None else ["--profile", str(out.absolute())]
     words += [] if seed is None else ["--seed", str(seed)]
     # With another network than the default one a grasp would not use the bundle's.
-    others = [one for one in set_ or [] if not one.startswith("vision.checkpoint=")]
-    if config is not None and load_settings(config, others, {}).vision.checkpoint != "default":
-        others.append("vision.checkpoint=default")
-    console.next_step(*words, *again(config, others))
+    overrides = [override for override in set_ or [] if not override.startswith("vision.checkpoint=")]
+    if config is not None and load_settings(config, overrides, {}).vision.checkpoint != "default":
+        overrides.append("vision.checkpoint=default")
+    console.next_step(*words, *config_options(config, overrides))
 
 
 def _refuse_recording(**options: object) -> None:
     """Raises `ConfigError` if one of the options of a recording of touches is given."""
-    if given := [name for name, value in options.items() if value not in (None, False)]:
-        name = given[0].replace("_", "-")
+    if names := [name for name, value in options.items() if value not in (None, False)]:
+        name = names[0].replace("_", "-")
         raise ConfigError(f"--{name} is for recording touches and --from records none; leave out one of them")
 
 
@@ -493,21 +493,21 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
 
 
 def _tell_left_out(result: "ObjectCalibration | Taught") -> None:
-    for why, paths in (
+    for reason, paths in (
         ("without contact", result.without_contact),
         ("starting in contact", result.contact_starts),
     ):
         if paths:
-            console.warn(f"left out {len(paths)} logs {why}: {', '.join(path.name for path in paths)}")
+            console.warn(f"left out {len(paths)} logs {reason}: {', '.join(path.name for path in paths)}")
 
 
 def _tell_other_objects(name: str, logs: Sequence[Path]) -> None:
     from gripper_force.config import config_from_text
     from gripper_force.runtime.log_reader import LogReader
 
-    others = {config_from_text(LogReader(path).config, str(path)).object for path in logs} - {name}
-    if others:
-        console.warn(f"there are logs of {', '.join(sorted(others))} among those for {name}")
+    other_objects = {config_from_text(LogReader(path).config, str(path)).object for path in logs} - {name}
+    if other_objects:
+        console.warn(f"there are logs of {', '.join(sorted(other_objects))} among those for {name}")
 
 
 def _touches(
@@ -542,21 +542,21 @@ def _rig_settings(
     """
     from gripper_force.profiles.rig_profile import read_rig
 
-    settings, new = load_settings_before_rig(config, set_, options)
-    if new is not None and rig is not None and rig.resolve() != new.resolve():
-        read_rig(new)  # raises: this command does not write it
-    return settings, rig or new or settings.calibration.rig or Path("rig_profile.yaml")
+    settings, new_rig = load_settings_before_rig(config, set_, options)
+    if new_rig is not None and rig is not None and rig.resolve() != new_rig.resolve():
+        read_rig(new_rig)  # raises: this command does not write it
+    return settings, rig or new_rig or settings.calibration.rig or Path("rig_profile.yaml")
 
 
 def _next_step(
     words: list[str], config: Path | None, set_: list[str] | None, rig: Path | None = None
 ) -> None:
     """Prints the step that follows, with the same configuration except the object, and the written rig profile."""
-    dropped = ("object=", *([] if rig is None else ["calibration.rig="]))
-    keys = [key for key in set_ or [] if not key.startswith(dropped)]
+    omitted = ("object=", *([] if rig is None else ["calibration.rig="]))
+    keys = [key for key in set_ or [] if not key.startswith(omitted)]
     if rig is not None:
         keys.append(f"calibration.rig={rig}")
-    console.next_step(*words, *again(config, keys))
+    console.next_step(*words, *config_options(config, keys))
 
 
 def _show_rig(
@@ -564,8 +564,8 @@ def _show_rig(
 ) -> None:
     """Shows the calibrated section of the rig profile and what else was measured, as one level of keys."""
     values = console.jsonable(result)
-    shown = values.pop("calibration") | values
-    console.show(shown, as_json, lambda _: output.rig_table(shown, names))
+    row = values.pop("calibration") | values
+    console.show(row, as_json, lambda _: output.rig_table(row, names))
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

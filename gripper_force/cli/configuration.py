@@ -105,5 +105,5 @@ def shipped_files() -> dict[str, Path]:
 
     package = Path(__file__).parents[1]
     examples = next(folder for base in (package, package.parent) if (folder := base / "examples").is_dir())
-    found = [path for path in sorted(examples.rglob("*")) if path.suffix in (".yaml", ".xml", ".stl")]
-    return {path.name: path for path in (*found, UDEV_RULES, FOXGLOVE_LAYOUT)}
+    paths = [path for path in sorted(examples.rglob("*")) if path.suffix in (".yaml", ".xml", ".stl")]
+    return {path.name: path for path in (*paths, UDEV_RULES, FOXGLOVE_LAYOUT)}

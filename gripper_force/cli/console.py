@@ -42,38 +42,38 @@ T = TypeVar("T")
 class Bar:
     """A running progress bar: a `Progress` callback that can be taken off the screen while a person is asked."""
 
-    def __init__(self, shown: ProgressBar, task: TaskID) -> None:
-        self._shown, self._task = shown, task
-        self.stop, self.start = shown.stop, shown.start
-        self.has_done = False
+    def __init__(self, progress_bar: ProgressBar, task: TaskID) -> None:
+        self._progress_bar, self._task = progress_bar, task
+        self.stop, self.start = progress_bar.stop, progress_bar.start
+        self.has_progressed = False
 
     def __call__(self, text: str, steps: int = 1) -> None:
         """Reports progress, see `Progress`."""
-        self.has_done |= not text.startswith("failed: ") and steps > 0
-        self._shown.update(self._task, advance=steps, note=text)
+        self.has_progressed |= not text.startswith("failed: ") and steps > 0
+        self._progress_bar.update(self._task, advance=steps, note=text)
 
 
 @contextmanager
 def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Bar]":
     """Shows a progress bar with the remaining time on stderr, unless it is hidden, and gives its callback."""
-    left = TimeRemainingColumn(elapsed_when_finished=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), left)
+    remaining = TimeRemainingColumn(elapsed_when_finished=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), remaining)
     note = TextColumn("{task.fields[note]}", markup=False)
-    shown = ProgressBar(*columns, note, console=err, disable=hidden, speed_estimate_period=_SPEED_S)
-    running = Bar(shown, shown.add_task(label, total=total, note=""))
+    progress_bar = ProgressBar(*columns, note, console=err, disable=hidden, speed_estimate_period=_SPEED_S)
+    callback = Bar(progress_bar, progress_bar.add_task(label, total=total, note=""))
     if err.is_terminal:  # elsewhere it is printed once, at its end
-        shown.start()
+        progress_bar.start()
     try:
-        yield running
+        yield callback
     except Exception:
-        shown.live.transient = not running.has_done  # the input is wrong, and the error says all
+        progress_bar.live.transient = not callback.has_progressed  # wrong input: the error says all
         raise
     finally:
-        if hidden or shown.live.transient:
-            shown.live.stop()
+        if hidden or progress_bar.live.transient:
+            progress_bar.live.stop()
         else:
-            shown.start()
-            shown.stop()
+            progress_bar.start()
+            progress_bar.stop()
 
 
 def bar_or_lines(label: str, total: int) -> "AbstractContextManager[Progress]":
@@ -84,12 +84,12 @@ def bar_or_lines(label: str, total: int) -> "AbstractContextManager[Progress]":
 @contextmanager
 def lines(label: str, total: int) -> "Iterator[Progress]":
     """Like `bar` for a log file: prints a line on stderr for each report of progress."""
-    done = 0
+    steps_done = 0
 
     def show(text: str, steps: int = 1) -> None:
-        nonlocal done
-        done += steps
-        line(f"{label}: {done} of {total}, {text}")
+        nonlocal steps_done
+        steps_done += steps
+        line(f"{label}: {steps_done} of {total}, {text}")
 
     yield show
 
@@ -106,7 +106,7 @@ def status_text(status: "Status") -> "Progress":
 
 @contextmanager
 def answering(unanswered: str) -> Iterator[None]:
-    """Asks a question of typer's in its block.
+    """Converts the end of the input and Ctrl-C while its block asks a question with typer.
 
     Args:
         unanswered: Text of the error if the input ends.
@@ -157,10 +157,10 @@ def next_page(page: Path) -> None:
     err.print(f"next: {_as_typed('open', page)}", soft_wrap=True, markup=False)
 
 
-def tell_kept(what: str, *, fresh: bool) -> None:
+def tell_resumable(what: str, *, fresh: bool) -> None:
     """Prints after an interruption that the same command continues; with ``--fresh`` it would start over."""
-    same = "the same command without --fresh" if fresh else "the same command"
-    err.print(f"{what}; {same} continues there", soft_wrap=True, markup=False)
+    retry = "the same command without --fresh" if fresh else "the same command"
+    err.print(f"{what}; {retry} continues there", soft_wrap=True, markup=False)
 
 
 def prompt(
@@ -210,7 +210,7 @@ def show(result: T, as_json: bool, render: Callable[[T], object] | None = None) 
     if as_json:
         sys.stdout.write(json.dumps(jsonable(result), allow_nan=False) + "\n")
     elif render is None:
-        pairs({words(name): value for name, value in jsonable(result).items()})
+        pairs({label(name): value for name, value in jsonable(result).items()})
     else:
         render(result)
 
@@ -231,7 +231,7 @@ def jsonable(value: Any) -> Any:
 
 
 def tell_missing_parquet(folder: Path | None) -> None:
-    """Says before the work begins that a summary in this folder will lack the estimates' file, if it will."""
+    """Says before the work begins if a summary in this folder will lack the file of the estimates."""
     from gripper_force.jobs.summary_files import missing_parquet
 
     if folder is not None and (text := missing_parquet()):
@@ -266,11 +266,11 @@ def number(value: object, unit: str = "", digits: int = 3) -> str:
     return f"{value:z.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
 
 
-def words(key: str) -> str:
+def label(key: str) -> str:
     """Returns a key of JSON in plain words, with its unit at the end: ``mae_n`` as ``MAE, N``."""
     for suffix, unit in _UNITS.items():
         if key.endswith(f"_{suffix}"):
-            return f"{words(key.removesuffix(f'_{suffix}'))}, {unit}"
+            return f"{label(key.removesuffix(f'_{suffix}'))}, {unit}"
     return " ".join(_NAMES.get(word, word) for word in key.split("_"))
 
 

@@ -72,9 +72,9 @@ def simulate(
     from gripper_force.jobs import simulate as job
 
     plans: list[job.Plan]
-    chosen = [text for text in set_ or () if text.partition("=")[0] in ("object", "seed", "target_n")]
+    conflicts = [text for text in set_ or () if text.partition("=")[0] in ("object", "seed", "target_n")]
     _refuse(
-        {f"--set {text}": text for text in chosen},
+        {f"--set {text}": text for text in conflicts},
         "can't be used: simulate chooses object, seed and target of each log; use --object or --first-seed",
     )
     if protocol is None:
@@ -90,14 +90,14 @@ def simulate(
         }
         plans = [*_plans(counts, 100_000 if first_seed is None else first_seed, object_)]
     elif protocol == "shin2019":
-        own = {
+        options = {
             "--presses": presses,
             "--taps": taps,
             "--grasps": grasps,
             "--first-seed": first_seed,
             "--object": object_,
         }
-        _refuse(own, "can't be combined with --protocol, whose sets are fixed; omit one of them")
+        _refuse(options, "can't be combined with --protocol, whose sets are fixed; omit one of them")
         settings = load_settings(config, [f"camera.rate_hz={paper_protocol.RATE_HZ}", *(set_ or [])], {})
         plans = list(paper_protocol.plan_protocol(scale or "full", instances or "same"))
     else:
@@ -105,14 +105,14 @@ def simulate(
     names = [name for p in plans for name in p.names]
     if not names:
         raise ConfigError("there is nothing to simulate; give --presses, --taps or --grasps a number above 0")
-    made = 0
+    count = 0
     with console.bar("simulating", len(names)) as progress:
         progress("", sum((folder / name).exists() for name in names))
         with closing(job.simulate(plans, folder, settings, jobs, ray)) as paths:
             for path in paths:
-                made += 1
+                count += 1
                 progress(path.name)
-    console.show({"logs": len(names), "made": made, "folder": str(folder)}, as_json)
+    console.show({"logs": len(names), "made": count, "folder": str(folder)}, as_json)
     if protocol is None:
         console.next_step("train", folder, "--out", "force.safetensors")
     else:
@@ -121,11 +121,11 @@ def simulate(
 
 def _refuse(options: Mapping[str, object], problem: str) -> None:
     """Raises `ConfigError` if one of the options is given."""
-    if given := [name for name, value in options.items() if value is not None]:
-        raise ConfigError(f"{' and '.join(given)} {problem}")
+    if names := [option for option, value in options.items() if value is not None]:
+        raise ConfigError(f"{' and '.join(names)} {problem}")
 
 
-def _plans(counts: "Mapping[Kind, int]", seed: int, given: list[str] | None) -> "Iterator[SimulationPlan]":
+def _plans(counts: "Mapping[Kind, int]", seed: int, names: list[str] | None) -> "Iterator[SimulationPlan]":
     """Yields the logs of each kind in turn, with the given objects and groups, or the paper's objects."""
     from gripper_force.jobs.grasp import PAPER_OBJECTS
     from gripper_force.jobs.simulate import plan
@@ -133,7 +133,7 @@ def _plans(counts: "Mapping[Kind, int]", seed: int, given: list[str] | None) -> 
 
     groups = {"training-kinds": training_kinds, "held-out-kinds": held_out_kinds}
     objects: list[str] = []
-    for name in given or PAPER_OBJECTS:
+    for name in names or PAPER_OBJECTS:
         objects += groups[name]() if name in groups else (name,)
     for kind, count in counts.items():
         yield from plan(kind, count, seed, tuple(objects))
@@ -184,8 +184,8 @@ def record(
         for path in job.record(settings, plan, folder, progress):
             progress(path.name)
     console.show(summarise_recording(paths), as_json, sets_table)
-    few = () if sets > _MANY_SETS else ("--recipe", "few")
-    console.next_step("train", folder / "train", *few, "--out", "force.safetensors")
+    recipe_options = () if sets > _MANY_SETS else ("--recipe", "few")
+    console.next_step("train", folder / "train", *recipe_options, "--out", "force.safetensors")
 
 
 @import_app.command("video")

@@ -74,7 +74,7 @@ def train(
     """Train the force network on logs; under `torchrun`, in several processes."""
     require("torch", "train")
     from gripper_force.jobs.training.recipe import continued
-    from gripper_force.jobs.training.recipe import recipe as named
+    from gripper_force.jobs.training.recipe import recipe as load_recipe
     from gripper_force.jobs.training.train import PROGRESS_STEPS, state_paths
     from gripper_force.jobs.training.train import train as job
     from gripper_force.runtime import process
@@ -82,45 +82,45 @@ def train(
     from gripper_force.vision.checkpoint_writer import check_writable
 
     check_writable(checkpoint)
-    settings = named(recipe, set_)
-    start = load_checkpoint(init) if init else None
-    if start is not None:
-        settings = continued(settings, start.header)
+    settings = load_recipe(recipe, set_)
+    initial = load_checkpoint(init) if init else None
+    if initial is not None:
+        settings = continued(settings, initial.header)
     states = state_paths(settings, checkpoint)
-    before = _saved(states)
-    if resume and not before:
-        missing = f"there is no {states[0]}" if states else "a Gaussian process is fitted at once"
+    old_states = _saved(states)
+    if resume and not old_states:
+        reason = f"there is no {states[0]}" if states else "a Gaussian process is fitted at once"
         raise ConfigError(
-            f"no training was interrupted that --resume can continue: {missing}; leave out --resume"
+            f"no training was interrupted that --resume can continue: {reason}; leave out --resume"
         )
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
-    used = _read_for_training(data, validation, replay, settings, jobs, quiet=quiet)
-    used = used.without_objects(hold_out or [])
+    clips = _read_for_training(data, validation, replay, settings, jobs, quiet=quiet)
+    clips = clips.without_objects(hold_out or [])
     left_out = 0
     if not include_contact_starts:
-        loaded = used.logs
-        used = used.without_contact_starts(settings)
-        left_out = loaded - used.logs
+        count = clips.logs
+        clips = clips.without_contact_starts(settings)
+        left_out = count - clips.logs
         if not quiet:
-            _warn_left_out(left_out, loaded)
+            _warn_left_out(left_out, count)
     warnings: list[str] = []
     try:
         with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
             result = job(
                 settings,
-                used.training,
+                clips.training,
                 checkpoint,
-                validation_clips=used.validation if validation else None,
-                init=start,
+                validation_clips=clips.validation if validation else None,
+                init=initial,
                 teacher=load_checkpoint(teacher) if teacher else None,
-                replay_clips=used.replayed,
+                replay_clips=clips.replayed,
                 resume=resume,
                 progress=progress,
                 warn=warnings.append,
             )
     except BaseException as end:
         interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
-        if interrupted and not quiet and (resume or _saved(states) != before):
+        if interrupted and not quiet and (resume or _saved(states) != old_states):
             console.err.print("the training was saved; add --resume to the same command to continue it")
         raise
     if not quiet:
@@ -138,20 +138,20 @@ class _Clips(NamedTuple):
 
     def without_objects(self, names: list[str]) -> "_Clips":
         """Returns the recordings without these objects, which stay in the validation."""
-        there = {clip.object for clip in (*self.training, *self.replayed)}
-        if unknown := sorted(set(names) - there):
+        objects = {clip.object for clip in (*self.training, *self.replayed)}
+        if unknown := sorted(set(names) - objects):
             raise ConfigError(
-                f"--hold-out: no log is of {', '.join(unknown)}; there are {', '.join(sorted(there))}"
+                f"--hold-out: no log is of {', '.join(unknown)}; there are {', '.join(sorted(objects))}"
             )
         training, replayed = (
-            [clip for clip in part if clip.object not in names] for part in (self.training, self.replayed)
+            [clip for clip in clips if clip.object not in names] for clips in (self.training, self.replayed)
         )
         return _Clips(training, self.validation, replayed)
 
     def without_contact_starts(self, settings: "TrainConfig") -> "_Clips":
         from gripper_force.jobs.dataset import without_contact_starts
 
-        return _Clips(*(without_contact_starts(part, settings.preprocess) for part in self))
+        return _Clips(*(without_contact_starts(clips, settings.preprocess) for clips in self))
 
     @property
     def logs(self) -> int:
@@ -171,8 +171,8 @@ def _read_for_training(
     from gripper_force.jobs.dataset import digest, find_logs, load_clips
 
     folders = [
-        find_logs(given) if given else []
-        for given in (data, [validation] if validation else [], [replay] if replay else [])
+        find_logs(paths) if paths else []
+        for paths in (data, [validation] if validation else [], [replay] if replay else [])
     ]
     _refuse_learned([[path.resolve() for path in logs] for logs in folders], folders[1])
     with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
@@ -188,8 +188,8 @@ def _read_for_training(
 def _refuse_learned(keys: Sequence[Sequence[object]], validation: list[Path]) -> None:
     """Raises `ConfigError` if logs of the validation have keys of those to train on or to replay."""
     training, tested, replayed = keys
-    seen = {*training, *replayed}
-    if both := [path for key, path in zip(tested, validation, strict=True) if key in seen]:
+    learned = {*training, *replayed}
+    if both := [path for key, path in zip(tested, validation, strict=True) if key in learned]:
         raise ConfigError(
             f"{len(both)} logs of --validation are among those to train on, such as {both[0]}; the error on them would "
             "say nothing: name other folders"
@@ -206,13 +206,13 @@ def _show_trained(
 ) -> None:
     for text in warnings:
         console.warn(text)
-    found = {"checkpoint": str(path), "digest": result.digest, **result.header.metrics}
+    values = {"checkpoint": str(path), "digest": result.digest, **result.header.metrics}
     if figure is not None:
-        found["figure"] = str(figure)
+        values["figure"] = str(figure)
     console.show(
-        {**found, "left_out": left_out, "warnings": warnings},
+        {**values, "left_out": left_out, "warnings": warnings},
         as_json,
-        lambda _: console.pairs({console.words(key): value for key, value in found.items()}),
+        lambda _: console.pairs({console.label(key): value for key, value in values.items()}),
     )
     console.next_step("evaluate", "FOLDER", "--checkpoint", path)
 
@@ -405,10 +405,10 @@ def reproduce(
             figures[name] = str(pictures / page.picture_name(scale, scales[0], name))
             figure.savefig(figures[name])
     if write is not None:
-        for place, text in page.markdown(result, scale, scales[0], pictures.name).items():
-            write_between(write, place, text)
-    tables = [table for made in result.tables.values() for table in made]
-    printed = {
+        for block, text in page.markdown(result, scale, scales[0], pictures.name).items():
+            write_between(write, block, text)
+    tables = [table for group in result.tables.values() for table in group]
+    report = {
         "instances": scales[0].instances,
         "steps": [one.steps for one in scales],
         "seeds": scales[0].seeds,
@@ -416,7 +416,7 @@ def reproduce(
         "figures": figures,
         "missing": result.missing,
     }
-    console.show(printed, as_json, lambda _: paper_tables(tables, figures))
+    console.show(report, as_json, lambda _: paper_tables(tables, figures))
     if result.missing:
         console.warn(f"{result.missing}; run the same command again to continue")
 

@@ -53,7 +53,7 @@ _NAMES: Final = {"sim.yaw_deg": "--degrees", "calibration.object": "--profile"}
 """Options whose names are not the last part of their keys."""
 
 
-def again(config: Path | None, overrides: list[str] | None) -> list[str]:
+def config_options(config: Path | None, overrides: list[str] | None) -> list[str]:
     """Returns the options with which the next command has the same configuration."""
     return [
         *(() if config is None else ("--config", str(config))),
@@ -90,8 +90,8 @@ def _load(
 ) -> "Config":
     from gripper_force.config import load_with_options
 
-    given = {_name(key): {key: value} for key, value in options.items() if value is not None}
-    return load_with_options(path, overrides, given, new_rig=new_rig)
+    layers = {_name(key): {key: value} for key, value in options.items() if value is not None}
+    return load_with_options(path, overrides, layers, new_rig=new_rig)
 
 
 def _name(key: str) -> str:

@@ -19,7 +19,7 @@ from gripper_force.cli.options import (
     Overrides,
     Ray,
     SummaryFolder,
-    again,
+    config_options,
     load_settings,
     load_settings_before_rig,
 )
@@ -113,17 +113,17 @@ def grasp(
             "calibration.object": profile,
         },
     )
-    own = {text.partition("=")[0] for text in set_ or ()}
-    named = object_ is not None or "object" in own or settings.sim.object is not None
-    own_target_n = settings.target_n if target_n is not None or "target_n" in own else None
-    one_object = not trials or bool(job.exclusive_device(settings)) or same_object or named
+    set_keys = {text.partition("=")[0] for text in set_ or ()}
+    names_object = object_ is not None or "object" in set_keys or settings.sim.object is not None
+    explicit_target_n = settings.target_n if target_n is not None or "target_n" in set_keys else None
+    one_object = not trials or bool(job.exclusive_device(settings)) or same_object or names_object
     objects = (settings.object,) if one_object else job.PAPER_OBJECTS
     for text in dict.fromkeys(text for name in objects for text in _notes(settings, name)):
         console.line(text)
     if not trials:
         _grasp_once(settings, view, as_json)
     else:
-        _grasp_trials(settings, trials, objects, own_target_n, same_object, jobs, yes, as_json)
+        _grasp_trials(settings, trials, objects, explicit_target_n, same_object, jobs, yes, as_json)
 
 
 def _grasp_once(settings: "Config", view: str | None, as_json: bool) -> None:
@@ -191,38 +191,38 @@ def _grasp_trials(
         prompt=prompt,
         progress=lines,
     )
-    results, failure = _finished(running, count, hidden=bool(device))
+    results, failure = _run_trials(running, count, hidden=bool(device))
     if results and not (as_json and isinstance(failure, GripperError)):
         summary = job.summarise_trials(results, settings.control.force_limit_n)
         figure = job.write_figure(settings, results, summary)
-        printed = {"trials": results, "summary": summary, "figure": figure}
-        console.show(printed, as_json, lambda _: trials_table(results, summary, figure))
+        report = {"trials": results, "summary": summary, "figure": figure}
+        console.show(report, as_json, lambda _: trials_table(results, summary, figure))
     if failure is not None:
         raise failure
-    worst = max(results, key=lambda one: abs(one["steady_error_n"] or 0.0))
-    console.next_step("replay", worst["log"], "--report")
-    if all(one["result"] != "held" for one in results):
+    worst_trial = max(results, key=lambda trial: abs(trial["steady_error_n"] or 0.0))
+    console.next_step("replay", worst_trial["log"], "--report")
+    if all(trial["result"] != "held" for trial in results):
         raise typer.Exit(1)
 
 
-def _finished(
+def _run_trials(
     running: "Generator[GraspSummary, None, None]", count: int, *, hidden: bool
 ) -> tuple[list["GraspSummary"], BaseException | None]:
     """Runs trials with a progress bar. Returns their results, and the error or interruption that ended them."""
     results: list[GraspSummary] = []
     with console.bar("grasping", count, hidden=hidden) as progress:
         try:
-            with closing(running) as finished:
-                for one in finished:
-                    results.append(one)
-                    progress(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
+            with closing(running) as summaries:
+                for summary in summaries:
+                    results.append(summary)
+                    progress(f"{summary['object']} {summary['target_n']:.1f} N: {summary['result']}")
         except (KeyboardInterrupt, GripperError) as end:
             return results, end
     return results, None
 
 
 def _notes(settings: "Config", name: str) -> list[str]:
-    """Returns the bundle that grasps of an object use, and what differs from the rig it or the network is for."""
+    """Returns notes on the bundle that grasps of an object use, and on differences from the rig of its profiles."""
     from gripper_force.runtime.resolve import resolve
 
     resolved = resolve(settings.with_values(object=name))
@@ -288,13 +288,13 @@ def replay(
     pages: list[str] = []
     unreported: dict[str, GripperError] = {}
     if report:
-        whole = [path for path in paths if str(path) not in replays.failed]
-        pages, unreported = _write_reports(whole, checkpoint, set_, recover)
+        readable = [path for path in paths if str(path) not in replays.failed]
+        pages, unreported = _write_reports(readable, checkpoint, set_, recover)
     if out is not None:
         title = f"Replay of {len(replays.results)} logs"
         write_summary(out, title, replay_tables({"": replays}), replays.columns)
-    lacking = {log: str(error) for log, error in unreported.items()}
-    _show_replays(replays, pages, lacking, as_json, alone=len(paths) == 1)
+    report_problems = {log: str(error) for log, error in unreported.items()}
+    _show_replays(replays, pages, report_problems, as_json, is_single=len(paths) == 1)
     if out is not None:
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     if set_ or checkpoint:
@@ -320,36 +320,36 @@ def _write_reports(
     write = partial(write_report, recover=recover, checkpoint=checkpoint, overrides=overrides)
     with console.bar("writing reports", len(logs), hidden=len(logs) == 1) as progress:
         try:
-            written, problems = Workers().read_logs(write, logs, "report of", progress)
+            reports, problems = Workers().read_logs(write, logs, "report of", progress)
         except GripperError as error:  # all failed: the figures are shown all the same
-            written, problems = {}, {0: error}
-    pages = [str(one.html) for one in written.values()]
+            reports, problems = {}, {0: error}
+    pages = [str(report.html) for report in reports.values()]
     return pages, {str(logs[number]): error for number, error in problems.items()}
 
 
 def _show_replays(
-    replays: "Replays", pages: list[str], unreported: dict[str, str], as_json: bool, *, alone: bool
+    replays: "Replays", pages: list[str], unreported: dict[str, str], as_json: bool, *, is_single: bool
 ) -> None:
     """Shows one result, or with several logs the results and the errors over all."""
     from gripper_force.jobs.replay.comparison import summarise_replays
 
     results = replays.results
     failures = {"unreported": unreported} if unreported else {}
-    if alone:
+    if is_single:
         report = {"report": pages[0]} if pages else {}
-        shown = {**console.jsonable(results[0]), **report, **failures}
-        console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
+        result = {**console.jsonable(results[0]), **report, **failures}
+        console.show(result, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
         return
     overall = summarise_replays(results)
     unread = {log: str(error) for log, error in replays.failed.items()}
-    printed = {
+    result_of_all = {
         "logs": results,
         "summary": overall,
         **({"failed": unread} if unread else {}),
         **({"reports": pages} if pages else {}),
         **failures,
     }
-    console.show(printed, as_json, lambda _: replays_table(results, overall, pages))
+    console.show(result_of_all, as_json, lambda _: replays_table(results, overall, pages))
 
 
 def _compare(
@@ -371,40 +371,40 @@ def _compare(
 
     if names[0] == names[1]:
         raise ConfigError(f"--compare {names[0]} {names[1]} compares a setting with itself; name two")
-    sides = [_choice(text) for text in names]
+    sides = [_parse_side(text) for text in names]
     first_log = _first_readable(paths, recover)
-    for other, changes in sides:
-        if other is not None:
-            read_model(other)  # a wrong side ends the command before the first one is computed
+    for checkpoint, changes in sides:
+        if checkpoint is not None:
+            read_model(checkpoint)  # a wrong side ends the command before the first one is computed
         if first_log is not None:
-            changed_config(first_log, other, [*(set_ or []), *changes])
+            changed_config(first_log, checkpoint, [*(set_ or []), *changes])
     with console.bar("replaying", 2 * len(paths)) as progress:
         first, second = (
-            replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
-            for other, changes in sides
+            replay_all(checkpoint=checkpoint, overrides=[*(set_ or []), *changes], progress=progress)
+            for checkpoint, changes in sides
         )
     console.warn_of_other_rig(text for one in (*first.results, *second.results) for text in one.other_rig)
     failed = {**first.failed, **second.failed}
-    kept, others = (
+    first_pairs, second_pairs = (
         [(r, one) for r, one in zip(side.results, side.columns, strict=True) if r.log not in failed]
         for side in (first, second)
     )
-    frames = [one for _, one in kept], [one for _, one in others]
-    found = paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
-    if not found and not failed:
+    frames = [one for _, one in first_pairs], [one for _, one in second_pairs]
+    differences = paired_differences([r for r, _ in first_pairs], [r for r, _ in second_pairs], frames)
+    if not differences and not failed:
         raise DataError("the logs have no load cell to compare with; replay logs of runs with one")
-    printed = {"logs": len(kept), "first": names[0], "second": names[1], "differences": found}
+    result = {"logs": len(first_pairs), "first": names[0], "second": names[1], "differences": differences}
     if failed:
-        printed["failed"] = {log: str(error) for log, error in failed.items()}
+        result["failed"] = {log: str(error) for log, error in failed.items()}
     if out is not None:
-        tables = replay_tables(dict(zip(names, (first, second), strict=True)), found)
+        tables = replay_tables(dict(zip(names, (first, second), strict=True)), differences)
         columns = [
             {"setting": np.full(len(one["log"]), name), **one}
             for name, side in zip(names, (first, second), strict=True)
             for one in side.columns
         ]
         write_summary(out, f"Replay with {names[0]} and with {names[1]}", tables, columns)
-    console.show(printed, as_json, lambda _: differences_table(*names, found))
+    console.show(result, as_json, lambda _: differences_table(*names, differences))
     if out is not None:
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     console.err.print(_OPEN_LOOP, soft_wrap=True)
@@ -412,7 +412,7 @@ def _compare(
 
 
 def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:
-    return [*(() if checkpoint is None else ("--checkpoint", checkpoint)), *again(None, overrides)]
+    return [*(() if checkpoint is None else ("--checkpoint", checkpoint)), *config_options(None, overrides)]
 
 
 def _first_readable(paths: Sequence[Path], recover: bool) -> "LogReader | None":
@@ -424,11 +424,11 @@ def _first_readable(paths: Sequence[Path], recover: bool) -> "LogReader | None":
     return None
 
 
-def _choice(text: str) -> tuple[str | None, list[str]]:
+def _parse_side(side: str) -> tuple[str | None, list[str]]:
     """Returns the checkpoint and the changed keys that one side of --compare names."""
-    if text == "log":
+    if side == "log":
         return None, []
-    return (None, [text]) if "=" in text else (text, [])
+    return (None, [side]) if "=" in side else (side, [])
 
 
 def doctor(
@@ -458,7 +458,7 @@ def doctor(
     console.show({"checks": checks, "ok": ok}, as_json, lambda _: checks_table(checks))
     if not ok:
         raise typer.Exit(1)
-    console.next_step("grasp", *again(config, set_))
+    console.next_step("grasp", *config_options(config, set_))
 
 
 def virtual_servo(

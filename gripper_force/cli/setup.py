@@ -61,9 +61,9 @@ def setup(
         except (GripperError, KeyboardInterrupt):
             status.stop()
             if running.rig.path.exists():
-                console.tell_kept(f"what was found so far is in {config}", fresh=fresh)
+                console.tell_resumable(f"what was found so far is in {config}", fresh=fresh)
             raise
-    words = _next(running, config)
+    words = _next_words(running, config)
     result = {"rig": config, "steps": reports, "next": console.command(*words)}
     console.show(
         result, as_json, lambda _: console.out.print(f"rig file: {config}", soft_wrap=True, markup=False)
@@ -71,14 +71,14 @@ def setup(
     console.next_step(*words)
 
 
-def _next(running: "Setup", path: Path) -> list[str]:
-    """Returns the words of the command that follows: teaching needs camera and load cell, and all need each step."""
-    settings, place = running.config, ["--config", str(path)]
+def _next_words(running: "Setup", path: Path) -> list[str]:
+    """Returns the words of the next command: `setup` while steps are left; `teach` needs camera and load cell."""
+    settings, options = running.config, ["--config", str(path)]
     if running.pending:
-        return ["setup", *place]
+        return ["setup", *options]
     if settings.uses_vision and settings.load_cell.backend != "none":
-        return ["teach", "NAME", *place]
-    return ["grasp", *place, "--target-n", "3"]
+        return ["teach", "NAME", *options]
+    return ["grasp", *options, "--target-n", "3"]
 
 
 class _Terminal:

@@ -85,7 +85,7 @@ def faults(
     live: Annotated[
         int | None,
         typer.Option(
-            min=0, help="Of these, grasps repeated in real time. Default: 2 with faults, all when wrong."
+            min=0, help="Grasps of each row repeated in real time. Default: 2 in table faults, all in wrong."
         ),
     ] = None,
     write: Page = None,

@@ -66,10 +66,10 @@ def view(
     from gripper_force.runtime.log_reader import LogReader
 
     reader = None if follow else LogReader(log, recover=recover)
-    shown = RerunViewer(log, save, live=follow)
+    rerun = RerunViewer(log, save, live=follow)
     if follow:
         _ready(as_json)
-    job.show(reader or job.GrowingLog(log, job.wait_for_writer()), shown)
+    job.show(reader or job.GrowingLog(log, job.wait_for_writer()), rerun)
     console.show({"log": log, "viewer": viewer, "file": save}, as_json)
 
 
@@ -80,7 +80,7 @@ def _serve_foxglove(log: Path, port: int, *, follow: bool, recover: bool, as_jso
 
     reader = None if follow else LogReader(log, recover=recover)
     server = FoxgloveViewer(log.stem, port, reader)
-    how = (
+    instruction = (
         f"open {server.app_url} or, in the Foxglove app, the connection {server.url}; import the layout "
         f"{job.FOXGLOVE_LAYOUT}"
     )
@@ -90,14 +90,14 @@ def _serve_foxglove(log: Path, port: int, *, follow: bool, recover: bool, as_jso
                 {"log": log, "url": server.url, "layout": job.FOXGLOVE_LAYOUT}, as_json, lambda _: None
             )
             sys.stdout.flush()
-            console.line(f"{how}; serving until Ctrl-C")
+            console.line(f"{instruction}; serving until Ctrl-C")
             server.play(reader)
             return
         if as_json:
-            console.show({"text": f"{how}; the run begins then", "url": server.url}, as_json)
+            console.show({"text": f"{instruction}; the run begins then", "url": server.url}, as_json)
             sys.stdout.flush()
         else:
-            console.line(how)
+            console.line(instruction)
         wait = job.wait_for_writer()
         server.wait_for_app(wait)
         _ready(as_json)

@@ -1016,7 +1016,7 @@ def test_each_value_of_a_calibration_is_named_in_plain_words(
     ],
 )
 def test_a_key_of_json_is_shown_as_plain_words_with_its_unit(key: str, words: str) -> None:
-    assert console.words(key) == words
+    assert console.label(key) == words
 
 
 @pytest.mark.parametrize(("result", "told"), [("timeout", True), ("held", False)])

@@ -157,10 +157,10 @@ def recognition_table(rows: "Sequence[Figures]") -> None:
     out.print(table)
 
 
-def checkpoints_table(found: Mapping[str, Mapping[str, float]]) -> None:
+def checkpoints_table(errors_of: Mapping[str, Mapping[str, float]]) -> None:
     """Prints the errors of checkpoints on the same logs."""
     table = Table("checkpoint", "MAE N", "RMSE N", "bias N", box=None)
-    for name, errors in found.items():
+    for name, errors in errors_of.items():
         table.add_row(name, *(number(errors[key]) for key in ("mae_n", "rmse_n", "bias_n")))
     out.print(table)
 

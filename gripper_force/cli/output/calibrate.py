@@ -83,7 +83,7 @@ CAMERA: Final = {
 
 def rig_table(r: Mapping[str, object], names: Mapping[str, str]) -> None:
     """Prints the calibrated values of a rig that have a name, each with its 95 % interval."""
-    pairs({name: _found(r[key]) for key, name in names.items()})
+    pairs({name: _value_text(r[key]) for key, name in names.items()})
 
 
 def jaws_table(r: "JawsResult") -> None:
@@ -103,7 +103,7 @@ def weight_table(r: "WeightResult") -> None:
     """Prints what a weight measured, and the proposed configuration."""
     pairs(
         {
-            "torque constant, Nm/A": _found(r.nm_per_a.model_dump()),
+            "torque constant, Nm/A": _value_text(r.nm_per_a.model_dump()),
             "breakaway friction": f"{r.breakaway_n:.2f} N",
         }
     )
@@ -111,14 +111,14 @@ def weight_table(r: "WeightResult") -> None:
     out.print(f"\nput this into your configuration:\ngripper:\n{keys}", end="")
 
 
-def _found(value: object) -> object:
+def _value_text(value: object) -> object:
     if isinstance(value, list):
         return (" to " if len(value) == 2 else ", ").join(f"{item:.5g}" for item in value)
     if not isinstance(value, dict):
         return value
     if "low" not in value:  # settings
-        known = {name: setting for name, setting in value.items() if setting is not None}
-        return ", ".join(f"{name} {setting}" for name, setting in known.items()) or None
+        settings = {name: setting for name, setting in value.items() if setting is not None}
+        return ", ".join(f"{name} {setting}" for name, setting in settings.items()) or None
     if value["low"] is None:
         return f"{value['value']:.6g} (given)"
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"
@@ -131,7 +131,7 @@ def network_table(checkpoint: str, model: "OodModel", views: "KnownViews | None"
         {
             "checkpoint": checkpoint,
             "limits of the score": ", ".join(
-                f"{one.limit:.2f} at {one.force_n:.1f} N" for one in model.limits
+                f"{limit.limit:.2f} at {limit.force_n:.1f} N" for limit in model.limits
             ),
             "limit of the known views": "as before: there are too few sets"
             if views is None

@@ -32,5 +32,5 @@ def changes_table(servo: str, changes: "list[RegisterChange]") -> None:
 
 def setup_line(r: "SetupResult") -> None:
     """Prints the result of a servo's setup."""
-    done = "written and read back" if r.applied else "unchanged"
-    out.print(f"servo {r.servo}: {done if r.changes else 'nothing to change'}")
+    result = "written and read back" if r.applied else "unchanged"
+    out.print(f"servo {r.servo}: {result if r.changes else 'nothing to change'}")

@@ -16,9 +16,9 @@ def paper_tables(tables: "Sequence[paper.Table]", figures: "Mapping[str, str]") 
     """Prints the paper's tables, and the files of its figures."""
     from gripper_force.qualification.paper.paper_tables import cell_text
 
-    for made in tables:
-        table = Table(*made.columns, title=made.title, title_justify="left", box=None)
-        for row in made.rows:
+    for paper_table in tables:
+        table = Table(*paper_table.columns, title=paper_table.title, title_justify="left", box=None)
+        for row in paper_table.rows:
             table.add_row(*map(cell_text, row))
         out.print(table)
         out.print()

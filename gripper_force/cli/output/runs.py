@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Column, Table
 
-from gripper_force.cli.console import number, out, pairs, words
+from gripper_force.cli.console import label, number, out, pairs
 
 if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.evaluate import Evaluation
@@ -108,12 +108,12 @@ def trials_table(
         "good_percent": f"within {100 * WITHIN_SHARE:g} % or {WITHIN_N:g} N, %",
         "over_limit": "above the force limit",
     }
-    plain = {names.get(key) or words(key): value for key, value in summary.items() if key != "estimate_mae_n"}
+    rows = {names.get(key) or label(key): value for key, value in summary.items() if key != "estimate_mae_n"}
     if summary["peak_n"] is None:
-        pairs({name: value for name, value in plain.items() if value is not None})
+        pairs({name: value for name, value in rows.items() if value is not None})
         out.print("No load cell: force errors, overshoot and peaks can't be measured.")
         return
-    pairs(plain)
+    pairs(rows)
     table = _table("MAE over the run, N", "vision", "current", "fused", "floor")
     for name, e in summary["estimate_mae_n"].items():
         table.add_row(escape(name), *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
@@ -124,7 +124,7 @@ def trials_table(
 
 def errors_table(r: "Evaluation") -> None:
     """Prints errors of estimates: over all frames, by object and by force."""
-    pairs({words(key): getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
+    pairs({label(key): getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
     table = _table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames")
     for name, o in r.per_object.items():
         figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
@@ -146,11 +146,11 @@ def replay_table(r: "ReplayResult", report: str | None = None) -> None:
     identical = {True: "yes, bit for bit", False: "no", None: "nothing to compare"}[r.identical]
     if r.note:
         identical += f": {r.note}"
-    found = {"identical": identical}
+    values = {"identical": identical}
     if r.changed and not r.identical:
-        found["commands"] = f"at most {1e3 * r.changed['goal_current_a']:.0f} mA from the run's"
-        found["fused force"] = f"at most {r.changed['fused_n']:.2f} N from the run's"
-    pairs({**found, "log": r.log, **({} if report is None else {"report": report})})
+        values["commands"] = f"at most {1e3 * r.changed['goal_current_a']:.0f} mA from the run's"
+        values["fused force"] = f"at most {r.changed['fused_n']:.2f} N from the run's"
+    pairs({**values, "log": r.log, **({} if report is None else {"report": report})})
     if not r.sources:
         out.print("No load cell: force errors can't be measured.")
         return

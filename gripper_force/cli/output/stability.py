@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final, TypedDict, cast
 from rich.markup import escape
 from rich.table import Table
 
-from gripper_force.cli.console import number, out, pairs, words
+from gripper_force.cli.console import label, number, out, pairs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -157,5 +157,5 @@ def soak_table(r: "SoakReport") -> None:
             number(s.simulated_s, digits=0), number(s.memory_mb, digits=1), str(s.handles), str(s.threads)
         )
     out.print(table)
-    summary = {words(key): value for key, value in r.items() if key not in ("samples", "outcomes")}
+    summary = {label(key): value for key, value in r.items() if key not in ("samples", "outcomes")}
     pairs({**summary, "outcomes": ", ".join(f"{n} {name}" for name, n in r["outcomes"].items())})
