@@ -11,5 +11,5 @@ def bfloat16_instructions() -> str:
     Only Linux lists them. PyTorch emulates bfloat16 on a CPU without them: a training step then takes about ten times
     as long as with float32.
     """
-    found = re.search(r"\b\w*bf16\b", "\n".join(cpu_info()))
-    return found[0] if found else ""
+    match = re.search(r"\b\w*bf16\b", "\n".join(cpu_info()))
+    return match[0] if match else ""

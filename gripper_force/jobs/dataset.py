@@ -143,17 +143,17 @@ def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
         DataError: There are no logs, or none in a folder.
         ConfigError: One is no path.
     """
-    given = source if isinstance(source, Iterable) and not isinstance(source, str) else [source]
-    found: dict[Path, Path] = {}
-    for path in (as_path(one, "a log", "name a file or a folder") for one in given):
+    sources = source if isinstance(source, Iterable) and not isinstance(source, str) else [source]
+    logs_by_path: dict[Path, Path] = {}
+    for path in (as_path(one, "a log", "name a file or a folder") for one in sources):
         logs = sorted(p for p in path.rglob("*.mcap") if not p.is_dir()) if path.is_dir() else [path]
         if not logs:
             raise DataError(f"no logs (*.mcap) in {path}; record, simulate or import some")
         for log in logs:
-            found.setdefault(log.resolve(), log)
-    if not found:
+            logs_by_path.setdefault(log.resolve(), log)
+    if not logs_by_path:
         raise DataError("no logs are given; name some, or a folder of them")
-    return list(found.values())
+    return list(logs_by_path.values())
 
 
 def load_clips(
@@ -206,13 +206,13 @@ def without_contact_starts(clips: Sequence[Clip], preprocess: "Preprocess") -> l
     Raises:
         DataError: No clip is left.
     """
-    kept = [clip for clip in clips if not starts_in_contact(clip.forces_n, preprocess)]
-    if clips and not kept:
+    usable = [clip for clip in clips if not starts_in_contact(clip.forces_n, preprocess)]
+    if clips and not usable:
         raise DataError(
             f"all {len(clips)} recordings start in contact (more than {CONTACT_N} N), so their first frames are no "
             "reference; record them again from open jaws, or add --include-contact-starts"
         )
-    return kept
+    return usable
 
 
 def split_by(

@@ -79,26 +79,26 @@ def setup(config: Config, confirm: Confirm, *, commission: bool = False) -> Setu
 
 def serial_ports() -> list[str]:
     """Returns the paths of the serial ports that are plugged in, those that stay after a restart if there are such."""
-    found: list[str] = import_module(_SCAN).ports()
-    return found
+    ports: list[str] = import_module(_SCAN).ports()
+    return ports
 
 
 def scan_servos(config: Config, ports: Iterable[str], progress: Progress = no_progress) -> list[PortScan]:
     """Looks for servos on each port at every baud rate of the X series. Nothing is written."""
-    found: list[PortScan] = import_module(_SCAN).scan(config, ports, progress=progress)
-    return found
+    scans: list[PortScan] = import_module(_SCAN).scan(config, ports, progress=progress)
+    return scans
 
 
 def find_cameras() -> list[Tree]:
     """Returns the keys of the section ``camera`` for each camera that is plugged in."""
-    found: list[Tree] = import_module(PROBES["camera"]).find()
-    return found
+    cameras: list[Tree] = import_module(PROBES["camera"]).find()
+    return cameras
 
 
 def find_load_cell(config: Config, ports: Iterable[str], progress: Progress = no_progress) -> Tree | None:
     """Returns the keys of ``load_cell`` for the first port that sends a load cell's lines, or None."""
-    found: Tree | None = import_module(PROBES["load cell"]).find(config, ports, progress)
-    return found
+    section: Tree | None = import_module(PROBES["load cell"]).find(config, ports, progress)
+    return section
 
 
 def _probe(module: str, config: Config) -> Iterator[Check]:
@@ -110,8 +110,8 @@ def _guarded(unit: str, checks: Iterable[Check]) -> Iterator[Check]:
         yield from checks
     except GripperError as error:
         # An error message states the problem, then the remedy.
-        found, _, advice = str(error).partition("; ")
-        yield Check(unit, "usable", found, False, advice)
+        problem, _, advice = str(error).partition("; ")
+        yield Check(unit, "usable", problem, False, advice)
     except Exception as error:  # a defect of one probe must not hide the results of the others
         yield Check(
             unit, "usable", f"{type(error).__name__}: {error}", False, "a defect of gripper-force: report it"
@@ -127,8 +127,8 @@ def _network(config: Config) -> Iterator[Check]:
 
     config, model, _ = resolve_vision(config)
     # The region is one of the camera's frames, which can be larger than those that this check makes.
-    whole = config.with_values(vision={"region": None})
-    estimator = make_estimator(ResolvedConfig(whole, model))
+    uncropped = config.with_values(vision={"region": None})
+    estimator = make_estimator(ResolvedConfig(uncropped, model))
     assert model is not None  # the configuration has vision
     assert estimator is not None
     vision = config.vision
@@ -145,14 +145,14 @@ def _network(config: Config) -> Iterator[Check]:
     for _ in range(model.header.preprocess.lead_in):
         step()
     median_ms, p99_ms = time_ms(step, 50)
-    found = f"median {median_ms:.1f} ms, p99 {p99_ms:.1f} ms of 50"
+    result = f"median {median_ms:.1f} ms, p99 {p99_ms:.1f} ms of 50"
     frame_ms = 1e3 / config.camera.rate_hz
     advice = (
         f"slower than the frames at camera.rate_hz={config.camera.rate_hz:g}: close other programs, or set "
         "vision.engine=auto or vision.checkpoint=small"
     )
     lockstep = config.clock == "lockstep"
-    yield judged("network", "step", found, median_ms <= frame_ms, advice, harmless=lockstep)
+    yield judged("network", "step", result, median_ms <= frame_ms, advice, harmless=lockstep)
 
 
 def _opencv() -> Iterator[Check]:
@@ -161,9 +161,9 @@ def _opencv() -> Iterator[Check]:
 
     installed = [f"{name} {found.version}" for name in _OPENCV for found in metadata.distributions(name=name)]
     remedy = f"pip uninstall {' '.join(_OPENCV)}, then pip install {_OPENCV[0]}"
-    whole = hasattr(getattr(cv2, "aruco", None), "ArucoDetector")
+    has_aruco = hasattr(getattr(cv2, "aruco", None), "ArucoDetector")
     found = f"cv2 {cv2.__version__} of {', '.join(installed) or 'no known distribution'}"
-    if whole:
+    if has_aruco:
         advice = f"each overwrites the module cv2 of the others, and to remove one breaks it: {remedy}"
         yield judged("opencv", "module", found, len(installed) <= 1, advice, harmless=True)
     else:
@@ -175,15 +175,15 @@ def _clock(config: Config) -> Iterator[Check]:
     lockstep = config.clock == "lockstep"
     with real_time_priority() as refusal:
         advice = refusal.rpartition("; ")[2]
-        found = "refused" if refusal else "granted"
-        yield judged("clock", "priority", found, not refusal, advice, harmless=True)
+        result = "refused" if refusal else "granted"
+        yield judged("clock", "priority", result, not refusal, advice, harmless=True)
     clock, late_ns = MonotonicClock(), []
     for _ in range(200):
         due_ns = clock.now_ns() + _SLEEP_MS * NS_PER_MS
         clock.sleep_until_ns(due_ns)
         late_ns.append(clock.now_ns() - due_ns)
     median_ms, p99_ms = np.percentile(late_ns, (50, 99)) / NS_PER_MS
-    found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of 200 sleeps of {_SLEEP_MS} ms"
+    result = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of 200 sleeps of {_SLEEP_MS} ms"
     cycle_ms = 1e3 / config.control.rate_hz
     advice = f"more than a cycle at control.rate_hz={config.control.rate_hz:g}: close other programs"
-    yield judged("clock", "wakes late by", found, p99_ms <= cycle_ms, advice, harmless=lockstep)
+    yield judged("clock", "wakes late by", result, p99_ms <= cycle_ms, advice, harmless=lockstep)

@@ -157,25 +157,25 @@ def evaluate(
         objects=(objects,) if isinstance(objects, str) else tuple(objects),
         include_contact_starts=include_contact_starts,
     )
-    found, failed = Workers(workers, ray).read_logs(evaluate_log, paths, "evaluated", progress)
-    chosen = {paths[number]: log for number, log in found.items() if log is not None}
-    if not chosen:
-        raise _no_such_object(objects, [paths[number] for number in found])
-    used = [(path, log.clip, log.forces_n) for path, log in chosen.items() if log.forces_n is not None]
-    if not used:
-        without_contact_starts([log.clip for log in chosen.values()], model.header.preprocess)  # raises
-    clips = [clip for _, clip, _ in used]
-    forces_n = [estimates_n for _, _, estimates_n in used]
+    results, failed = Workers(workers, ray).read_logs(evaluate_log, paths, "evaluated", progress)
+    evaluated = {paths[number]: log for number, log in results.items() if log is not None}
+    if not evaluated:
+        raise _no_such_object(objects, [paths[number] for number in results])
+    usable = [(path, log.clip, log.forces_n) for path, log in evaluated.items() if log.forces_n is not None]
+    if not usable:
+        without_contact_starts([log.clip for log in evaluated.values()], model.header.preprocess)  # raises
+    clips = [clip for _, clip, _ in usable]
+    forces_n = [estimates_n for _, _, estimates_n in usable]
     lead_in = model.header.preprocess.lead_in
     result = replace(
         errors_on(clips, forces_n, lead_in),
-        left_out=len(chosen) - len(clips),
-        per_log={str(path): _log_errors(clip, estimates_n, lead_in) for path, clip, estimates_n in used},
+        left_out=len(evaluated) - len(clips),
+        per_log={str(path): _log_errors(clip, estimates_n, lead_in) for path, clip, estimates_n in usable},
         failed={str(paths[number]): str(error) for number, error in failed.items()},
-        other_rig=sorted({text for log in chosen.values() for text in log.other_rig}),
+        other_rig=sorted({text for log in evaluated.values() for text in log.other_rig}),
     )
     if folder is not None:
-        columns = [_columns(*log) for log in used]
+        columns = [_columns(*log) for log in usable]
         write_summary(folder, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
     if figure is not None:
         from gripper_force.jobs.report.plots import draw_estimates
@@ -196,9 +196,9 @@ def _settings(config: Config | None, checkpoint: str | Path, profile: str | None
 
 
 def _no_such_object(objects: Collection[str], paths: Sequence[Path]) -> DataError:
-    there = sorted({config_from_text(LogReader(path).config, str(path)).object for path in paths})
+    known_objects = sorted({config_from_text(LogReader(path).config, str(path)).object for path in paths})
     names = [objects] if isinstance(objects, str) else objects
-    return DataError(f"no log is of {', '.join(names)}; there are {', '.join(there)}")
+    return DataError(f"no log is of {', '.join(names)}; there are {', '.join(known_objects)}")
 
 
 def _columns(path: Path, clip: Clip, forces_n: npt.NDArray[np.floating]) -> dict[str, npt.NDArray[Any]]:
@@ -237,36 +237,36 @@ def _evaluate_log(
     settings = config_from(config, "evaluate")
     reader = LogReader(path)
     logged = config_from_text(reader.config, str(path))
-    own = settings.with_values(object=logged.object)
+    log_settings = settings.with_values(object=logged.object)
     if settings.calibration.object == "own":
-        own, _ = with_bundle(own)
-        if own.vision.checkpoint != settings.vision.checkpoint:
-            model = read_model(own.vision.checkpoint)
+        log_settings, _ = with_bundle(log_settings)
+        if log_settings.vision.checkpoint != settings.vision.checkpoint:
+            model = read_model(log_settings.vision.checkpoint)
             checkpoint = model.path, model.digest
-    loaded = kept_checkpoint(*checkpoint)
-    preprocess = loaded.header.preprocess
-    streamed = StreamedClip(reader, logged, reader.records(*CLIP_RECORDS), preprocess, settings.vision.region)
+    ensemble = kept_checkpoint(*checkpoint)
+    preprocess = ensemble.header.preprocess
+    stream = StreamedClip(reader, logged, reader.records(*CLIP_RECORDS), preprocess, settings.vision.region)
     if objects and logged.object not in objects:
         return None
-    profiles = read_profiles(own)
-    gain = gain_of(with_object(own.control, profiles).object_ratio, logged.gripper.gain_std)
+    profiles = read_profiles(log_settings)
+    gain = gain_of(with_object(log_settings.control, profiles).object_ratio, logged.gripper.gain_std)
     correction = None
     if settings.calibration.object is not None:
-        correction = read_correction(own, profiles, loaded, logged.rig_settings())
+        correction = read_correction(log_settings, profiles, ensemble, logged.rig_settings())
     forces_n = np.concatenate(
         [
-            estimate_frames(loaded, frames, correction, settings.vision.precision)[repeated:]
-            for repeated, frames in streamed.parts()
+            estimate_frames(ensemble, frames, correction, settings.vision.precision)[repeated:]
+            for repeated, frames in stream.parts()
         ]
         or [np.empty(0, np.float32)]
     )
-    clip = streamed.clip(streamed.no_images)
+    clip = stream.clip(stream.no_images)
     if starts_in_contact(clip.forces_n, preprocess) and not include_contact_starts:
         return _Evaluated(clip, None)
     region = settings.vision.region or logged.vision.region
-    used = logged.with_values(vision={"region": region})
-    differs = other_rig(loaded.header, used, is_profiled=correction is not None)
-    return _Evaluated(clip, (1.0 if gain is None else gain.gain) * forces_n, differs)
+    log_config = logged.with_values(vision={"region": region})
+    differences = other_rig(ensemble.header, log_config, is_profiled=correction is not None)
+    return _Evaluated(clip, (1.0 if gain is None else gain.gain) * forces_n, differences)
 
 
 def errors_on(

@@ -221,17 +221,17 @@ def summarise_grasp(path: Path) -> GraspSummary:
         records[type(record)].append(record)
     statuses, cells = records[GraspStatus], sorted(records[LoadCellSample], key=lambda c: c.t_ns)
     cycles_ns = [state.t_ns for state in records[ServoState]]
-    seen = [visual for visual in records[VisualForce] if math.isfinite(visual.force_n)]  # by the network
-    compute_ms = [visual.compute_ms for visual in seen]
-    vision_s = (seen[-1].t_ns - seen[0].t_ns) / NS_PER_S if len(seen) > 1 else 0.0
-    visuals = [visual for visual in seen if visual.is_familiar]
+    outputs = [visual for visual in records[VisualForce] if math.isfinite(visual.force_n)]  # by the network
+    compute_ms = [visual.compute_ms for visual in outputs]
+    vision_s = (outputs[-1].t_ns - outputs[0].t_ns) / NS_PER_S if len(outputs) > 1 else 0.0
+    visuals = [visual for visual in outputs if visual.is_familiar]
     config = config_from_text(reader.config, str(path))
     vision = vision_in_hold(statuses, records[FusedForce], visuals, records[Event])
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
-    shown = vision if expects_vision else None
-    if shown is not None and not config.uses_vision:
-        why = "the configuration has no network or no camera"
-        shown = HoldVision(0.0, [VisionLoss(why, sum(loss.time_s for loss in shown.losses))])
+    hold_vision = vision if expects_vision else None
+    if hold_vision is not None and not config.uses_vision:
+        reason = "the configuration has no network or no camera"
+        hold_vision = HoldVision(0.0, [VisionLoss(reason, sum(loss.time_s for loss in hold_vision.losses))])
     # A release that fails does not change what the grasp reached.
     outcomes = [s.outcome for s in statuses if s.outcome not in (Outcome.NONE, Outcome.BLOCKED)]
     result = outcomes[-1] if outcomes else "interrupted"
@@ -246,8 +246,8 @@ def summarise_grasp(path: Path) -> GraspSummary:
         "target_n": config.target_n,
         "seed": config.seed,
         "feedback": config.control.feedback,
-        "vision_share": None if shown is None else shown.share,
-        "vision_losses": [] if shown is None else shown.losses,
+        "vision_share": None if hold_vision is None else hold_vision.share,
+        "vision_losses": [] if hold_vision is None else hold_vision.losses,
         "object_gain": gains[-1].object_gain if gains else None,
         "object_gain_std": gains[-1].object_gain_std if gains else None,
         "object_gain_true": stiffness_of(reader.metadata) if has_object else None,
@@ -257,7 +257,7 @@ def summarise_grasp(path: Path) -> GraspSummary:
         "estimator_p50_ms": percentile(compute_ms, 50),
         "estimator_p99_ms": percentile(compute_ms, 99),
         "loop_hz": (len(cycles_ns) - 1) / span_s if span_s else None,
-        "camera_hz": (seen[-1].seq - seen[0].seq) / vision_s if vision_s else None,
+        "camera_hz": (outputs[-1].seq - outputs[0].seq) / vision_s if vision_s else None,
         "samples_rejected": sum(not cell.valid for cell in cells) if cells else None,
         "estimate_mae_n": {
             "visual": _mae_n([(v.t_ns, v.force_n) for v in visuals], cells),
@@ -312,8 +312,8 @@ def new_log(config: Config) -> Path:
     stamp = time.strftime("%Y%m%d-%H%M%S")
     stem = f"{stamp}-{config.object}-{config.target_n:g}N-{config.control.feedback}-seed{config.seed}"
     path = config.log.directory / f"{stem}.mcap"
-    again = 1
+    number = 1
     while path.exists():
-        again += 1
-        path = config.log.directory / f"{stem}-{again}.mcap"
+        number += 1
+        path = config.log.directory / f"{stem}-{number}.mcap"
     return path

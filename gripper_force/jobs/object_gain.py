@@ -91,9 +91,9 @@ def save_gain(
             "control.feedback=fused and control.learn_gain=true"
         )
     # The smallest and the largest ratio may be uncertain, and agree, where others do not.
-    worst = max(combinations(sorted(ratios), 2), key=_contradiction, default=None)
-    if worst is not None and _contradiction(worst) > GATE:
-        (low, _), (high, _) = worst
+    contradiction = max(combinations(sorted(ratios), 2), key=_contradiction, default=None)
+    if contradiction is not None and _contradiction(contradiction) > GATE:
+        (low, _), (high, _) = contradiction
         raise DataError(
             f"the logs contradict each other: motor current was {low:.2f} times the visual force in one, and "
             f"{high:.2f} times in another; pass logs of one object"
@@ -107,14 +107,14 @@ def save_gain(
     if gain.problem:
         raise DataError(f"the gain is not saved: {gain.problem}")
     target = out or (source if source.name == BUNDLED else user_folder() / f"{source.stem}.yaml")
-    changed = profile.model_copy(update={"ratio": total})
+    new_profile = profile.model_copy(update={"ratio": total})
     weights = _read_beside(source, weights_path(source))
     # The network of a bundle goes with its profile.
     if profile.network is not None and target.parent != source.parent:
         network = target.with_suffix(".network.safetensors")
         write_all({network: _read_beside(source, source.parent / profile.network)})
-        changed = changed.model_copy(update={"network": network.name})
-    write_object(target, changed, weights)
+        new_profile = new_profile.model_copy(update={"network": network.name})
+    write_object(target, new_profile, weights)
     return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
 
 

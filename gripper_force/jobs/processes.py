@@ -83,18 +83,18 @@ class Workers:
             GripperError: All logs failed; the error of the first. That of an unforeseen exception has it as its cause,
                 or in another process as its note.
         """
-        found: dict[int, R] = {}
+        results: dict[int, R] = {}
         failed: dict[int, GripperError] = {}
         with closing(self._run_each(partial(_run_named, function), logs)) as answers:
-            for number, answer in answers:
-                if isinstance(answer, GripperError):
-                    failed[number] = answer
+            for number, result in answers:
+                if isinstance(result, GripperError):
+                    failed[number] = result
                 else:
-                    found[number] = answer
+                    results[number] = result
                 progress(f"{'failed:' if number in failed else verb} {logs[number].name}")
-        if failed and not found:
+        if failed and not results:
             raise failed[min(failed)]
-        return dict(sorted(found.items())), dict(sorted(failed.items()))
+        return dict(sorted(results.items())), dict(sorted(failed.items()))
 
     def _run_each(
         self, function: Callable[[Path], R], logs: Sequence[Path]
@@ -114,7 +114,7 @@ class Workers:
                 try:
                     result: R | GripperError = future.result()
                 except Exception as error:  # also of the way to the process and back
-                    result = _named(logs[number], error)
+                    result = _with_log_name(logs[number], error)
                 yield number, result
 
 
@@ -123,23 +123,24 @@ def _run_named(function: Callable[[Path], R], log: Path) -> R:
     try:
         return function(log)
     except Exception as error:
-        named = _named(log, error)
-        if named is error:
+        named_error = _with_log_name(log, error)
+        if named_error is error:
             raise
-        raise named from error
+        raise named_error from error
 
 
-def _named(log: Path, error: Exception) -> GripperError:
+def _with_log_name(log: Path, error: Exception) -> GripperError:
     """Returns an error itself if it was foreseen, or one that names the log, the exception and its place."""
     if isinstance(error, GripperError):
         return error
     calls = traceback.extract_tb(error.__traceback__)
-    own = [call for call in calls[1:] if "gripper_" in call.filename] or calls  # the first is `_run_named`
-    place = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+    # The first call is `_run_named`.
+    own_calls = [call for call in calls[1:] if "gripper_" in call.filename] or calls
+    location = f" at {Path(own_calls[-1].filename).name}:{own_calls[-1].lineno}" if own_calls else ""
     reason = (str(error) or "no reason").splitlines()[0][:200]
     return DataError(
-        f"{log} failed with {type(error).__name__}{place}: {reason}; leave this log out, and report it as a fault of "
-        "gripper-force"
+        f"{log} failed with {type(error).__name__}{location}: {reason}; leave this log out, and report it as a fault "
+        "of gripper-force"
     )
 
 
@@ -243,10 +244,10 @@ class _ProcessPool(Executor):
                     process.join()
                     code = process.exitcode
                 connection = None
-                how = "was killed, perhaps for lack of memory; use fewer --jobs"
+                reason = "was killed, perhaps for lack of memory; use fewer --jobs"
                 if code != -signal.SIGKILL:
-                    how = f"ended with code {code}; run it again"
-                future.set_exception(GripperError(f"a worker process {how}"))
+                    reason = f"ended with code {code}; run it again"
+                future.set_exception(GripperError(f"a worker process {reason}"))
             except Exception as error:
                 future.set_exception(error)
             else:
@@ -267,8 +268,8 @@ class _ProcessPool(Executor):
         )  # of this thread, inherited by the process
         context = get_context("spawn")
         try:
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(theirs, allowed_options()))
+            connection, worker_connection = context.Pipe()
+            process = context.Process(target=_serve, args=(worker_connection, allowed_options()))
             with self._lock:
                 if self._is_closed:
                     raise EOFError
@@ -278,8 +279,8 @@ class _ProcessPool(Executor):
             raise GripperError(
                 f"a worker process can't be started: {error.strerror}; use fewer --jobs"
             ) from error
-        theirs.close()
-        return process, ours
+        worker_connection.close()
+        return process, connection
 
 
 def _serve(connection: Connection, options: ProcessOptions) -> None:

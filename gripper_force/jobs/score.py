@@ -178,10 +178,10 @@ def vision_in_hold(
         if sources.get(status.t_ns, EstimateSource.CURRENT) != EstimateSource.CURRENT:
             used += 1
             continue
-        before = bisect_right(reasons, status.t_ns, key=lambda entry: entry[0])
-        reason = reasons[before - 1][1] if before else "no estimate was used"
+        index = bisect_right(reasons, status.t_ns, key=lambda entry: entry[0])
+        reason = reasons[index - 1][1] if index else "no estimate was used"
         lost_s[_NUMBER.sub("", reason)][reason] += (after.t_ns - status.t_ns) / NS_PER_S
-    losses = [VisionLoss(max(same, key=same.__getitem__), sum(same.values())) for same in lost_s.values()]
+    losses = [VisionLoss(max(times, key=times.__getitem__), sum(times.values())) for times in lost_s.values()]
     return HoldVision(used / cycles, sorted(losses, key=lambda loss: -loss.time_s))
 
 

@@ -128,14 +128,14 @@ def simulate(
     out.mkdir(parents=True, exist_ok=True)
     tree = config.model_dump(mode="json")
     missing, objects = [], dict[str, tuple[Path, str]]()
-    for one in plans:
-        made = [path for name in one.names if (path := out / name).exists()]
-        if made:  # also if not all are: the others must fit to them
-            one.check(out, tree)
-        for path in made:
+    for plan in plans:
+        existing = [path for name in plan.names if (path := out / name).exists()]
+        if existing:  # also if not all are: the others must fit to them
+            plan.check(out, tree)
+        for path in existing:
             check_object_file(path, objects)
-        if len(made) < len(one.names):
-            missing.append(one)
+        if len(existing) < len(plan.names):
+            missing.append(plan)
     with Workers(workers, ray).pool() as pool:
         futures = [pool.submit(p.make, out, tree) for p in missing]
         for future in as_completed(futures):

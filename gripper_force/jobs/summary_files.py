@@ -101,10 +101,10 @@ def replay_tables(
                 tables["objects"].append({**head, "object": name, "source": source, **asdict(errors)})
         for result in replays.results:
             # A log without a load cell has a row, too, without errors.
-            known: Mapping[str, Comparison | None] = result.sources or {"": None}
-            for source, found in known.items():
+            comparisons: Mapping[str, Comparison | None] = result.sources or {"": None}
+            for source, comparison in comparisons.items():
                 figures = {
-                    field.name: None if found is None else getattr(found, field.name)
+                    field.name: None if comparison is None else getattr(comparison, field.name)
                     for field in fields(Comparison)
                     if field.name != "per_bin"
                 }

@@ -469,7 +469,7 @@ def test_a_frame_that_the_network_did_not_see_has_no_attention(grasp: Path) -> N
     for i, frame in enumerate(frames):
         covered = i >= 100
         sampler.add(dataclasses.replace(frame, gray=np.full_like(frame.gray, 90)) if covered else frame)
-    attention = [kept.attention is not None for kept in sampler._kept]
+    attention = [kept.attention is not None for kept in sampler._candidates]
     assert any(attention[:100])
     assert not any(attention[100:])
 
@@ -486,7 +486,7 @@ def test_a_frame_whose_estimate_is_not_finite_has_no_attention(
     monkeypatch.setattr(ForceEstimator, "update", diverge)
     for frame in islice(log.records(Frame), 3):
         sampler.add(frame)
-    assert [kept.attention for kept in sampler._kept] == [None] * 3
+    assert [kept.attention for kept in sampler._candidates] == [None] * 3
 
 
 @pytest.mark.parametrize("refused", [False, True])
@@ -496,7 +496,7 @@ def test_attention_follows_a_new_object_unless_it_was_refused(
     log = LogReader(grasp)
     sampler, before = FrameSampler(log), []
     frames = list(islice(log.records(Frame), 20))
-    monkeypatch.setattr(ForceEstimator, "renew_reference", lambda _: before.append(len(sampler._kept)))
+    monkeypatch.setattr(ForceEstimator, "renew_reference", lambda _: before.append(len(sampler._candidates)))
     for i, frame in enumerate(frames):
         if i == 10:
             now_ns = frames[10].t_ns  # frame 10 was on its way
@@ -521,7 +521,7 @@ def test_long_log_keeps_few_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     def add(record: Record) -> None:
         sampler.add(record)
-        kept.append(len(sampler._kept))
+        kept.append(len(sampler._candidates))
 
     shown, _ = sampler.pictures(read_run(reader, add))
     assert max(kept) <= 20

@@ -102,20 +102,20 @@ def find_environments(folder: Path) -> tuple[list[Path], list[str]]:
     if not folder.is_dir():
         raise DataError(f"{folder} is not a folder; check the path")
     entries = sorted(folder.iterdir())
-    found = [entry for entry in entries if entry.is_dir() and _FOLDER.fullmatch(entry.name)]
-    if not found:
+    folders = [entry for entry in entries if entry.is_dir() and _FOLDER.fullmatch(entry.name)]
+    if not folders:
         raise DataError(
             f"{folder} holds no folder named <object>_<degrees>_<illumination>, such as sponge_0_50; "
             "name the folder that holds these"
         )
-    if bare := [entry.name for entry in found if not (entry / "test.txt").is_file()]:
+    if bare := [entry.name for entry in folders if not (entry / "test.txt").is_file()]:
         raise DataError(
-            f"{len(bare)} of {len(found)} folders in {folder} have no test.txt: {', '.join(bare[:5])}; "
+            f"{len(bare)} of {len(folders)} folders in {folder} have no test.txt: {', '.join(bare[:5])}; "
             "download them again, or move them away"
         )
-    for entry in found:
+    for entry in folders:
         _environment(entry)
-    return found, [entry.name for entry in entries if entry not in found]
+    return folders, [entry.name for entry in entries if entry not in folders]
 
 
 def import_environment(
@@ -284,12 +284,12 @@ def read_table(path: Path) -> tuple[dict[int, float], list[str]]:
 
 
 def _row(line: str) -> tuple[int, float] | None:
-    found = _LINE.fullmatch(line)
+    match = _LINE.fullmatch(line)
     try:
-        force_n = float(found[2]) if found else math.nan
+        force_n = float(match[2]) if match else math.nan
     except ValueError:
         return None
-    return (int(found[1]), force_n) if found and abs(force_n) <= _MAX_FORCE_N else None
+    return (int(match[1]), force_n) if match and abs(force_n) <= _MAX_FORCE_N else None
 
 
 def find_sets(number: Numbers, force_n: Floats) -> list[tuple[int, int]]:
@@ -325,12 +325,12 @@ def _touches(force_n: Floats) -> tuple[Numbers, Numbers]:
 
 def _environment(folder: Path) -> tuple[str, int, str]:
     """Returns object, degrees and illumination from a folder's name."""
-    found = _FOLDER.fullmatch(folder.name)
-    if not found or found[3] not in LUX:
-        known = ", ".join(f"{name} ({lux} lux)" for name, lux in LUX.items())
-        raise DataError(f"the illumination in the name of {folder} is unknown; use one of {known}")
-    name = re.sub(r"[ _]+", "_", found[1].lower())
-    return {"papercup": "paper_cup"}.get(name, name), int(found[2]), found[3]
+    match = _FOLDER.fullmatch(folder.name)
+    if not match or match[3] not in LUX:
+        levels = ", ".join(f"{name} ({lux} lux)" for name, lux in LUX.items())
+        raise DataError(f"the illumination in the name of {folder} is unknown; use one of {levels}")
+    name = re.sub(r"[ _]+", "_", match[1].lower())
+    return {"papercup": "paper_cup"}.get(name, name), int(match[2]), match[3]
 
 
 def _read_image(path: Path) -> Gray | None:

@@ -165,8 +165,8 @@ def import_video(
 
 def object_of(name: str) -> str:
     """Returns the object in a recording's name: ``2023-12-16_foam_brick_2`` is a ``foam_brick``."""
-    found = re.fullmatch(r"(?:\d{4}-?\d{2}-?\d{2}_)?(.+?)(?:_\d+)?", name)
-    return found[1] if found else name
+    match = re.fullmatch(r"(?:\d{4}-?\d{2}-?\d{2}_)?(.+?)(?:_\d+)?", name)
+    return match[1] if match else name
 
 
 def find_recordings(folder: Path) -> list[tuple[str, Path, Path]]:
@@ -175,12 +175,12 @@ def find_recordings(folder: Path) -> list[tuple[str, Path, Path]]:
     Raises:
         DataError: There is no recording, or one lacks its table.
     """
-    found = list(_recordings(folder))
-    if not found:
+    recordings = list(_recordings(folder))
+    if not recordings:
         raise DataError(
             f"{folder} holds no recordings; it needs X.avi with X.csv, or folders with one of each"
         )
-    return found
+    return recordings
 
 
 def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:

@@ -80,7 +80,7 @@ def replay_frames(
     overall = (
         {} if best is None else {key: getattr(best, key) for key in ("mae_n", "rmse_n", "bias_n", "frames")}
     )
-    differs = (
+    rig_differences = (
         []
         if resolved.model is None
         else other_rig(resolved.model.header, resolved.config, is_profiled=resolved.correction is not None)
@@ -99,7 +99,7 @@ def replay_frames(
         changed=agreement.changed,
         sources=sources,
         log=str(path),
-        other_rig=differs,
+        other_rig=rig_differences,
     )
     return result, columns_of(result.log, resolved.config.object, series, cells)
 
@@ -142,11 +142,11 @@ def replay_each(
     Raises:
         GripperError: No log could be replayed; the first one's error, as for `replay`.
     """
-    one = partial(replay_frames, checkpoint=checkpoint, overrides=overrides, recover=recover)
-    found, failed = Workers(workers, ray).read_logs(one, logs, "replayed", progress)
+    replay_one = partial(replay_frames, checkpoint=checkpoint, overrides=overrides, recover=recover)
+    results, failed = Workers(workers, ray).read_logs(replay_one, logs, "replayed", progress)
     return Replays(
-        [result for result, _ in found.values()],
-        [columns for _, columns in found.values()],
+        [result for result, _ in results.values()],
+        [columns for _, columns in results.values()],
         {str(logs[number]): error for number, error in failed.items()},
     )
 
@@ -166,20 +166,21 @@ def _note(reader: LogReader, resolved: ResolvedConfig) -> str:
     """Returns the reason why estimates or decisions may differ from the logged ones, or an empty text."""
     if reader.damaged:
         return f"{len(reader.damaged)} damaged parts of the log, of 0.1 s each, are left out"
-    wrote = reader.metadata.get("version gripper-force", "")
-    if wrote != __version__:
-        return f"version {wrote or 'unknown'} wrote the log, this is {__version__}: its controller may decide otherwise"
-    used = reader.metadata.get("checkpoint", "")
-    if resolved.model is None or used == "":
-        return "" if (resolved.model is None) == (used == "") else _other_vision(resolved)
+    run_version = reader.metadata.get("version gripper-force", "")
+    if run_version != __version__:
+        version = run_version or "unknown"
+        return f"version {version} wrote the log, this is {__version__}: its controller may decide otherwise"
+    run_digest = reader.metadata.get("checkpoint", "")
+    if resolved.model is None or run_digest == "":
+        return "" if (resolved.model is None) == (run_digest == "") else _other_vision(resolved)
     if has_faulty_estimates(resolved.config):
         return "faults were injected into the run's estimator, so only decisions are compared"
-    if used != resolved.model.digest:
-        return f"the run's checkpoint was {used[:12]}, this one is {resolved.model.digest[:12]}: estimates differ"
+    if run_digest != resolved.model.digest:
+        return f"the run's checkpoint was {run_digest[:12]}, this one is {resolved.model.digest[:12]}: estimates differ"
     profile = resolved.correction.profile.weights if resolved.correction else ""
-    used = reader.metadata.get("profile", "")
-    if used != profile:
-        names = [text[:12] or "none" for text in (used, profile)]
+    run_digest = reader.metadata.get("profile", "")
+    if run_digest != profile:
+        names = [text[:12] or "none" for text in (run_digest, profile)]
         return f"the run's object profile was {names[0]}, this one is {names[1]}: estimates differ"
     engine = config_from_text(reader.config, str(reader.path)).vision.engine
     if engine != resolved.config.vision.engine:

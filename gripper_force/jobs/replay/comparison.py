@@ -292,7 +292,7 @@ def paired_differences(
         columns: Their estimates (see `replay_frames`). With them, visual estimates are compared on the frames that
             the networks of both sides know: otherwise a network that rejects the hard frames would look better.
     """
-    found = {}
+    differences = {}
     for name in ("visual", "current", "fused"):
         pairs = [
             (a.sources[name].mae_n, b.sources[name].mae_n)
@@ -305,7 +305,7 @@ def paired_differences(
             continue
         a_n, b_n = np.array(pairs).T
         mean_n, low_n, high_n = metrics.mean_interval(b_n - a_n)
-        found[name] = PairedDifference(
+        differences[name] = PairedDifference(
             logs=len(pairs),
             first_n=float(a_n.mean()),
             second_n=float(b_n.mean()),
@@ -313,19 +313,19 @@ def paired_differences(
             low_n=low_n,
             high_n=high_n,
         )
-    return found
+    return differences
 
 
 def _common_errors_n(first: Columns, second: Columns) -> tuple[float, float] | None:
     """Returns the mean absolute errors over the frames that both networks know, or None without any."""
-    _, at, and_at = np.intersect1d(first["seq"], second["seq"], return_indices=True)
+    _, first_rows, second_rows = np.intersect1d(first["seq"], second["seq"], return_indices=True)
     errors_n = (
-        first["visual_n"][at] - first["measured_n"][at],
-        second["visual_n"][and_at] - second["measured_n"][and_at],
+        first["visual_n"][first_rows] - first["measured_n"][first_rows],
+        second["visual_n"][second_rows] - second["measured_n"][second_rows],
     )
-    known = np.isfinite(
-        first["visual_std_n"][at] + second["visual_std_n"][and_at] + errors_n[0] + errors_n[1]
+    is_common = np.isfinite(
+        first["visual_std_n"][first_rows] + second["visual_std_n"][second_rows] + errors_n[0] + errors_n[1]
     )
-    if not known.any():
+    if not is_common.any():
         return None
-    return float(np.abs(errors_n[0][known]).mean()), float(np.abs(errors_n[1][known]).mean())
+    return float(np.abs(errors_n[0][is_common]).mean()), float(np.abs(errors_n[1][is_common]).mean())

@@ -82,10 +82,10 @@ def run_again(reader: LogReader, resolved: ResolvedConfig) -> Replayed:
         reader: The log.
         resolved: Its configuration.
     """
-    kept = _Kept([], [], [])
-    agreement = feed(reader, resolved, kept)
+    sink = _ReplayRecords([], [], [])
+    agreement = feed(reader, resolved, sink)
     return Replayed(
-        agreement.estimates, agreement.decisions, agreement.changed, kept.visual, kept.decisions, kept.cells
+        agreement.estimates, agreement.decisions, agreement.changed, sink.visual, sink.decisions, sink.cells
     )
 
 
@@ -102,7 +102,7 @@ class Sink(Protocol):
         """Takes the next sample of the load cell."""
 
 
-class _Kept(NamedTuple):
+class _ReplayRecords(NamedTuple):
     """All that a replay computed, as records."""
 
     visual: list[VisualForce]
@@ -129,10 +129,10 @@ class Agreement(NamedTuple):
 
 def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink) -> Agreement:
     """Runs estimator and controller on a log, as `run_again`. Keeps no record for longer than it is needed."""
-    again = _Feed(reader, resolved, sink)
+    replay = _Feed(reader, resolved, sink)
     for record in reader.records():
-        again.take(record)
-    return again.agreement()
+        replay.take(record)
+    return replay.agreement()
 
 
 class _Feed:
@@ -173,9 +173,9 @@ class _Feed:
         elif isinstance(record, VisualForce):
             # A log whose disk was slow lacks frames; only their estimates are the logged ones.
             is_logged = self._is_faulty or (self._has_network and record.seq not in self._pending)
-            again = record if is_logged else self._pending.pop(record.seq, None)
-            if again is not None:  # the time at which it was ready is the run's, not this computer's
-                self._newest = replace(again, ready_ns=record.ready_ns)
+            estimate = record if is_logged else self._pending.pop(record.seq, None)
+            if estimate is not None:  # the time at which it was ready is the run's, not this computer's
+                self._newest = replace(estimate, ready_ns=record.ready_ns)
         elif isinstance(record, Request):
             self._request = record
         elif isinstance(record, ServoState) and self._controller is not None:
@@ -210,10 +210,10 @@ class _Feed:
         estimates, commands = self._estimates, self._commands
         # The run may have ended before it used the estimates of its last frames, and the last cycle of a truncated log
         # may be incomplete.
-        same = all(matcher.agree(extra=1) for matcher in (commands, self._fused, self._status))
+        decisions_agree = all(matcher.agree(extra=1) for matcher in (commands, self._fused, self._status))
         return Agreement(
             estimates.agree() if estimates.logged and not self._is_faulty else None,
-            same if commands.logged else None,
+            decisions_agree if commands.logged else None,
             {"goal_current_a": commands.largest, "fused_n": self._fused.largest} if commands.logged else {},
         )
 
@@ -236,7 +236,7 @@ class _RecordMatcher:
         self._key, self._difference = key, difference
         self._logged: deque[Any] = deque()
         self._replayed: deque[Any] = deque()
-        self._same, self._ended = True, False
+        self._all_equal, self._is_out_of_step = True, False
         self.logged = False
         self.largest = 0.0
 
@@ -253,15 +253,16 @@ class _RecordMatcher:
 
     def agree(self, extra: int | None = None) -> bool:
         """Returns True if all logged records equal the replay's, which may have ``extra`` more; None: any number."""
-        return self._same and not self._logged and (extra is None or len(self._replayed) <= extra)
+        return self._all_equal and not self._logged and (extra is None or len(self._replayed) <= extra)
 
     def _compare(self) -> None:
-        while self._logged and self._replayed and not self._ended:
+        while self._logged and self._replayed and not self._is_out_of_step:
             a, b = self._logged.popleft(), self._replayed.popleft()
-            self._same = self._same and self._key(a) == self._key(b)
+            self._all_equal = self._all_equal and self._key(a) == self._key(b)
             self.largest = max(self.largest, self._difference(a, b))
-        if self._ended or max(len(self._logged), len(self._replayed)) > _BACKLOG:  # a counterpart is missing
-            self._same, self._ended = False, True
+        # In the second case a counterpart is missing.
+        if self._is_out_of_step or max(len(self._logged), len(self._replayed)) > _BACKLOG:
+            self._all_equal, self._is_out_of_step = False, True
             self._logged.clear()
             self._replayed.clear()
 

@@ -54,9 +54,9 @@ def write_report(
         run = read_run(reader, sampler.add)
     else:
         stem = f"{log.stem}-replayed"
-        again = resolve_replay(changed_config(reader, checkpoint, overrides))
-        sampler = FrameSampler(reader, again.config)
-        run = read_run(reader, sampler.add, run_again(reader, again), again.config)
+        resolved = resolve_replay(changed_config(reader, checkpoint, overrides))
+        sampler = FrameSampler(reader, resolved.config)
+        run = read_run(reader, sampler.add, run_again(reader, resolved), resolved.config)
     paths = ReportPaths(log.with_name(f"{stem}.png"), log.with_name(f"{stem}.html"))
     pictures, note = sampler.pictures(run)
     figure = draw(run, pictures)

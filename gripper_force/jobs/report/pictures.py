@@ -94,19 +94,21 @@ class FrameSampler:
 
     Args:
         log: The log. The run's checkpoint is loaded to compute the attention, if the log names one.
-        changed: Configuration of a replay, whose checkpoint is loaded instead; None for the log's own.
+        replay_config: Configuration of a replay, whose checkpoint is loaded instead; None for the log's own.
 
     Raises:
         ConfigError: The log holds a configuration that this version does not understand.
     """
 
-    def __init__(self, log: LogReader, changed: "Config | None" = None) -> None:
-        config = changed or config_from_text(log.config, str(log.path))
+    def __init__(self, log: LogReader, replay_config: "Config | None" = None) -> None:
+        config = replay_config or config_from_text(log.config, str(log.path))
         self._region = config.vision.region
-        used = log.metadata.get("checkpoint", "")
-        self._estimator, self._note = _open_estimator(config, used, any_checkpoint=changed is not None)
+        digest = log.metadata.get("checkpoint", "")
+        self._estimator, self._note = _open_estimator(
+            config, digest, any_checkpoint=replay_config is not None
+        )
         self._renewals = RenewalFinder()
-        self._kept: list[_Candidate] = []
+        self._candidates: list[_Candidate] = []
         self._step = 1
         self._count = 0
 
@@ -125,22 +127,22 @@ class FrameSampler:
         if self._estimator is not None:
             # The run continued without an estimate for such a frame, too. If the checks rejected it, the network did
             # not see it, and the newest attention is that of an earlier frame.
-            seen = True
+            has_attention = True
             try:
                 if is_renewed:
                     self._estimator.renew_reference()
                 self._estimator.update(frame.gray)
             except UnfamiliarFrameError as error:
-                seen = math.isfinite(error.force_n)
+                has_attention = math.isfinite(error.force_n)
             except (DataError, NonFiniteError):
-                seen = False
-            attention = self._estimator.attention_map() if seen else None
+                has_attention = False
+            attention = self._estimator.attention_map() if has_attention else None
         if self._count % self._step == 0:
             gray = downscale(frame.gray, self._region, _SIDE_PX)
-            kept = None if attention is None else attention.copy()
-            self._kept.append(_Candidate(frame.t_ns, gray, kept))
-        if len(self._kept) > _KEPT:
-            self._kept = self._kept[::2]
+            attention_copy = None if attention is None else attention.copy()
+            self._candidates.append(_Candidate(frame.t_ns, gray, attention_copy))
+        if len(self._candidates) > _KEPT:
+            self._candidates = self._candidates[::2]
             self._step *= 2
         self._count += 1
 
@@ -153,13 +155,13 @@ class FrameSampler:
         Returns:
             The pictures in order, and a note on the attention: what is shown, or why it is not.
         """
-        if not self._kept:
+        if not self._candidates:
             return [], ""
-        t_s = (np.array([kept.t_ns for kept in self._kept]) - run.zero_ns) / NS_PER_S
+        t_s = (np.array([candidate.t_ns for candidate in self._candidates]) - run.zero_ns) / NS_PER_S
         begin_s, end_s = _grip(run)
         spread_s = np.linspace(max(begin_s - _LEAD_S, t_s[0]), min(end_s + _LEAD_S, t_s[-1]), COUNT)
-        chosen = sorted({int(np.abs(t_s - t).argmin()) for t in spread_s})
-        pictures = [_picture(self._kept[i], float(t_s[i]), run) for i in chosen]
+        indices = sorted({int(np.abs(t_s - t).argmin()) for t in spread_s})
+        pictures = [_picture(self._candidates[i], float(t_s[i]), run) for i in indices]
         return pictures, self._note if "vision" in run.forces else ""
 
 
@@ -169,8 +171,8 @@ def _grip(run: Run) -> tuple[float, float]:
     if phases:
         return phases[0].start_s, phases[-1].end_s
     cell = run.forces.get("load_cell")
-    if cell is not None and (touched := cell.value > _TOUCH_SHARE * cell.value.max()).any():
-        return float(cell.t_s[touched][0]), float(cell.t_s[touched][-1])
+    if cell is not None and (in_contact := cell.value > _TOUCH_SHARE * cell.value.max()).any():
+        return float(cell.t_s[in_contact][0]), float(cell.t_s[in_contact][-1])
     return run.begin_s, run.end_s
 
 
@@ -198,8 +200,8 @@ def _picture(frame: _Candidate, t_s: float, run: Run) -> Picture:
     attention = frame.attention if "vision" in run.forces else None
     gray = frame.gray
     image = np.repeat(gray[:, :, None], 3, axis=2)
-    seen = None if attention is None else overlay(gray, attention)
-    return Picture(t_s, image, seen, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
+    overlaid = None if attention is None else overlay(gray, attention)
+    return Picture(t_s, image, overlaid, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
 
 
 def overlay(gray: Gray, attention: Attention) -> Colour:

@@ -103,7 +103,7 @@ def read_run(
     uses_vision = controls_with_vision(config)
     outcome = next((s.outcome for s in reversed(of_grasp) if s.outcome), "")
     # A simulated camera's latency is a constant, and no measurement.
-    measured = config.camera.backend != "simulated"
+    is_measured = config.camera.backend != "simulated"
     return Run(
         name=log.path.stem,
         config=config,
@@ -128,8 +128,8 @@ def read_run(
         phases=_phases(zero_ns, end_s, status),
         event_rows=_event_rows(zero_ns, records[Request], status, events),
         compute_ms=np.array([v.compute_ms for v in vision]),
-        camera_age_ms=np.array(ages_ns if measured else []) / NS_PER_MS,
-        latency_ms=np.array([v.ready_ns - v.t_ns for v in vision] if measured else []) / NS_PER_MS,
+        camera_age_ms=np.array(ages_ns if is_measured else []) / NS_PER_MS,
+        latency_ms=np.array([v.ready_ns - v.t_ns for v in vision] if is_measured else []) / NS_PER_MS,
     )
 
 
@@ -154,8 +154,8 @@ def _replace(records: dict[type, list[Any]], replayed: Replayed) -> None:
         records[FusedForce] = [decision.estimate for decision in replayed.decisions]
         records[GraspStatus] = [decision.status for decision in replayed.decisions]
         records[ServoCommand] = [decision.command for decision in replayed.decisions]
-        kept = [e for e in records[Event] if e.unit not in _CONTROLLER or e.text.startswith(NO_ESTIMATE)]
-        records[Event] = kept + [event for decision in replayed.decisions for event in decision.events]
+        events = [e for e in records[Event] if e.unit not in _CONTROLLER or e.text.startswith(NO_ESTIMATE)]
+        records[Event] = events + [event for decision in replayed.decisions for event in decision.events]
 
 
 def _series(zero_ns: int, pairs: Iterable[tuple[int, float]]) -> Series:
@@ -266,7 +266,7 @@ def _ns(t_s: Floats) -> npt.NDArray[np.int64]:
 
 def _phases(zero_ns: int, end_s: float, status: list[GraspStatus]) -> list[Span]:
     pairs = zip([None, *status], status, strict=False)
-    starts = [s for before, s in pairs if before is None or before.phase != s.phase]
+    starts = [s for previous, s in pairs if previous is None or previous.phase != s.phase]
     times = [(s.t_ns - zero_ns) / NS_PER_S for s in starts] + [end_s]
     spans = [Span(times[i], times[i + 1], s.phase) for i, s in enumerate(starts)]
     return [span for span in spans if span.phase != Phase.OPEN]
@@ -276,16 +276,16 @@ def _event_rows(
     zero_ns: int, requests: list[Request], status: list[GraspStatus], events: list[Event]
 ) -> list[EventRow]:
     entries = [(r.t_ns, "request", request_text(r)) for r in requests]
-    before: GraspStatus | None = None
+    previous: GraspStatus | None = None
     for s in status:
-        if before is None or s.phase != before.phase:
+        if previous is None or s.phase != previous.phase:
             reason = f": {s.reason}" if s.reason not in {"", s.phase} else ""
             entries.append((s.t_ns, "phase", s.phase + reason))
         elif s.reason:
             entries.append((s.t_ns, "control", s.reason))
-        if s.outcome and (before is None or s.outcome != before.outcome):
+        if s.outcome and (previous is None or s.outcome != previous.outcome):
             entries.append((s.t_ns, "outcome", s.outcome))
-        before = s
+        previous = s
     entries += [(e.t_ns, e.unit, e.text) for e in events]
     entries.sort(key=lambda entry: entry[0])
     return [EventRow((t_ns - zero_ns) / NS_PER_S, unit, text) for t_ns, unit, text in entries]

@@ -312,12 +312,12 @@ def _network_keys(header: Header) -> dict[str, object]:
     """Returns the keys of a recipe that describe a checkpoint's networks and preprocessing."""
     members = [member for member in header.members if isinstance(member, NetworkConfig)]
     first = members[0]
-    found: dict[str, object] = {"attentions": tuple(member.attention for member in members)}
-    found |= {key: getattr(first, key) for key in ("earlier_frames", "backbone", "width", "hidden", "head")}
+    keys: dict[str, object] = {"attentions": tuple(member.attention for member in members)}
+    keys |= {key: getattr(first, key) for key in ("earlier_frames", "backbone", "width", "hidden", "head")}
     if sequential := [member for member in members if member.sequential]:
-        found["pooling"] = sequential[0].pooling  # no other attention has a choice
-    found |= {f"preprocess.{key}": value for key, value in header.preprocess.model_dump().items()}
-    return found
+        keys["pooling"] = sequential[0].pooling  # no other attention has a choice
+    keys |= {f"preprocess.{key}": value for key, value in header.preprocess.model_dump().items()}
+    return keys
 
 
 def _shown(value: object) -> str:

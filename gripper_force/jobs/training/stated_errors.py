@@ -39,22 +39,22 @@ def state_errors(
         DataError: The logs can't be used.
     """
     clips: dict[Preprocess, Sequence[Clip]] = {}
-    found: dict[str, dict[str, float]] = {}
+    errors_by_checkpoint: dict[str, dict[str, float]] = {}
     for checkpoint in checkpoints:
-        loaded = load_checkpoint(checkpoint)
-        preprocess = loaded.header.preprocess
+        ensemble = load_checkpoint(checkpoint)
+        preprocess = ensemble.header.preprocess
         if preprocess not in clips:
             clips[preprocess] = read(preprocess)
-        forces_n, measured_n = labelled_estimates(clips[preprocess], loaded.networks, preprocess, "cpu")
-        found[str(checkpoint)] = errors(forces_n, measured_n)
+        forces_n, measured_n = labelled_estimates(clips[preprocess], ensemble.networks, preprocess, "cpu")
+        errors_by_checkpoint[str(checkpoint)] = errors(forces_n, measured_n)
         if write:
-            stated = {
+            values = {
                 "residuals": residuals(forces_n, measured_n),
-                "metrics": loaded.header.metrics | found[str(checkpoint)],
+                "metrics": ensemble.header.metrics | errors_by_checkpoint[str(checkpoint)],
                 "test_digest": hashlib.sha256(measured_n.tobytes()).hexdigest(),
             }
-            replace_header(checkpoint, loaded.header.model_copy(update=stated))
-    return found
+            replace_header(checkpoint, ensemble.header.model_copy(update=values))
+    return errors_by_checkpoint
 
 
 def labelled_estimates(
@@ -85,9 +85,9 @@ def residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.floa
     """Returns the root mean squared error in bins of 1 N of the estimate, the only force known in a run."""
     squared = np.square(forces_n - measured_n)
     newtons = np.floor(forces_n)
-    found = []
+    result = []
     for newton in np.unique(newtons):
         part = squared[newtons == newton]
         variance = (part.sum() + RESIDUAL_PRIOR * squared.mean()) / (len(part) + RESIDUAL_PRIOR)
-        found.append(Residual(force_n=float(newton) + RESIDUAL_HALF_N, std_n=math.sqrt(variance)))
-    return tuple(found)
+        result.append(Residual(force_n=float(newton) + RESIDUAL_HALF_N, std_n=math.sqrt(variance)))
+    return tuple(result)

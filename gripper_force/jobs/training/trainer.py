@@ -182,12 +182,12 @@ class Trainer:
         """
         self._freeze_statistics = self._config.freeze_statistics is not False
         weights = network.state_dict()
-        before = network.config.outputs
+        outputs = network.config.outputs
         for name in ("out.weight", "out.bias"):
             rows = torch.zeros_like(self.network.state_dict()[name])
             for i, quantity in enumerate(self._config.outputs):
-                if quantity in before:
-                    rows[i] = weights[name][before.index(quantity)]
+                if quantity in outputs:
+                    rows[i] = weights[name][outputs.index(quantity)]
             weights[name] = rows
         self.network.load_state_dict(weights)
 

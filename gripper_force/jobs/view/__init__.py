@@ -86,12 +86,12 @@ class GrowingLog(LogReader):
         return True
 
     def _chunks_to_read(self) -> Iterator[Any]:
-        shown = 0
+        count = 0
         while True:
-            new = self._chunks[shown:]
-            yield from new
-            shown += len(new)
-            if self.complete or not (new or self._wait()):
+            new_chunks = self._chunks[count:]
+            yield from new_chunks
+            count += len(new_chunks)
+            if self.complete or not (new_chunks or self._wait()):
                 return
             with self.path.open("rb") as file:
                 self._scan(file)
