@@ -68,7 +68,7 @@ def find(sysfs: Path = _SYSFS) -> list[Tree]:
 
 def _settings_check(config: Config, settings: Mapping[str, float | str]) -> Check:
     """Shows the settings in force, and whether those that are configured are among them."""
-    shown = ", ".join(
+    text = ", ".join(
         f"{key} {value:g}" if isinstance(value, float | int) else f"{key} {value}"
         for key, value in settings.items()
     )
@@ -76,12 +76,12 @@ def _settings_check(config: Config, settings: Mapping[str, float | str]) -> Chec
         key
         for key, value in settings.items()
         if key in _CONTROLS
-        and (wanted := getattr(config.camera, key)) is not None
+        and (setting := getattr(config.camera, key)) is not None
         and isinstance(value, float | int)
-        and abs(value - wanted) > _SETTING_TOLERANCE * wanted
+        and abs(value - setting) > _SETTING_TOLERANCE * setting
     ]
     advice = f"the device does not keep {', '.join(f'camera.{key}' for key in differing)}: set what it can do"
-    return judged("camera", "settings", shown, not differing, advice)
+    return judged("camera", "settings", text, not differing, advice)
 
 
 def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
@@ -96,17 +96,17 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
     if config.camera.backend == "playback":
         yield Check("camera", "rate", f"{rate:.1f} Hz of playback", True)
     else:
-        measured = f"{rate:.1f} Hz of {config.camera.backend}, in {clock_name(config)}"
-        found = f"{measured}; {configured_hz:g} Hz configured"
+        rate_text = f"{rate:.1f} Hz of {config.camera.backend}, in {clock_name(config)}"
+        result = f"{rate_text}; {configured_hz:g} Hz configured"
         fast_enough = rate >= _MIN_RATE_SHARE * configured_hz
         advice = "set camera.rate_hz to the measured rate, shorten camera.exposure_us, or add light"
-        yield judged("camera", "rate", found, fast_enough, advice)
+        yield judged("camera", "rate", result, fast_enough, advice)
     latency_ms = float(np.median([frame.received_ns - frame.t_ns for frame in frames])) / NS_PER_MS
     estimate_hz = config.control.vision_rate_hz or configured_hz
     limit_ms = config.control.model_copy(update={"vision_rate_hz": estimate_hz}).max_frame_age_ms
-    found = f"median {latency_ms:.1f} ms from exposure to use"
+    result = f"median {latency_ms:.1f} ms from exposure to use"
     advice = f"every estimate would be older than control.vision_age_ms={limit_ms:.3g}: shorten the exposure"
-    yield judged("camera", "latency", found, latency_ms < limit_ms, advice)
+    yield judged("camera", "latency", result, latency_ms < limit_ms, advice)
     if config.uses_vision:
         from gripper_force.vision.preprocess import downscale  # `doctor` of a servo alone needs no vision
 

@@ -60,17 +60,17 @@ def device_pipeline(config: CameraConfig, stack: ExitStack) -> SensorOutput:
     return pipeline, output, size_px, _name(sensor)
 
 
-def choose_sensor(features: Sequence[Any], wanted: str | None) -> Any:
-    """Returns the sensor with the wanted socket or name (None: any). Raises `DeviceNotFoundError`.
+def choose_sensor(features: Sequence[Any], name: str | None) -> Any:
+    """Returns the sensor with this socket or name (None: any). Raises `DeviceNotFoundError`.
 
     Of several it is the mono sensor on the lowest socket, else the colour sensor there.
     """
     if not features:
         raise DeviceNotFoundError("the OAK device has no sensor connected; check its cameras' cables")
-    matches = [f for f in features if wanted is None or wanted.upper() in (f.socket.name, f.sensorName)]
+    matches = [f for f in features if name is None or name.upper() in (f.socket.name, f.sensorName)]
     if not matches:
         raise DeviceNotFoundError(
-            f"the OAK device has no sensor camera.sensor={wanted}; set it to a name or a socket of: "
+            f"the OAK device has no sensor camera.sensor={name}; set it to a name or a socket of: "
             f"{', '.join(map(_name, features))}"
         )
     return min(matches, key=lambda f: (not _is_mono(f), f.socket.value))
@@ -86,14 +86,14 @@ def choose_size(sensor: Any, config: CameraConfig) -> tuple[int, int]:
     rates_hz = rates_hz or {(sensor.width, sensor.height): config.rate_hz}
     # A rate of 59.94 is good enough for 60.
     fast = [size_px for size_px, rate_hz in rates_hz.items() if config.rate_hz <= math.ceil(rate_hz)]
-    wanted = config.resolution_px
-    if wanted in fast:
-        return wanted
-    if wanted or not fast:
-        known = ", ".join(f"{w}x{h} at up to {rate_hz:.0f}" for (w, h), rate_hz in rates_hz.items())
+    resolution_px = config.resolution_px
+    if resolution_px in fast:
+        return resolution_px
+    if resolution_px or not fast:
+        modes = ", ".join(f"{w}x{h} at up to {rate_hz:.0f}" for (w, h), rate_hz in rates_hz.items())
         raise DeviceError(
-            f"the sensor {_name(sensor)} has no mode for camera.rate_hz={config.rate_hz:g} with "
-            f"camera.resolution_px={list(wanted) if wanted else 'null'}; set them to one of its modes: {known}"
+            f"the sensor {_name(sensor)} has no mode for camera.rate_hz={config.rate_hz:g} with camera.resolution_px="
+            f"{list(resolution_px) if resolution_px else 'null'}; set them to one of its modes: {modes}"
         )
     excess_px = {(w, h): w * h - _MAX_DEFAULT_PX for w, h in fast}
     return min(fast, key=lambda size_px: (excess_px[size_px] > 0, abs(excess_px[size_px])))
@@ -215,14 +215,14 @@ def _reported(frame: Any, config: CameraConfig) -> Settings:
     return {key: value for key, value in settings.items() if value}
 
 
-def _find(wanted: str | int | None, available: Sequence[Any]) -> Any:
+def _find(device: str | int | None, available: Sequence[Any]) -> Any:
     """Returns the only device with this id or address (None: any). Raises `DeviceNotFoundError`."""
-    matches = [info for info in available if wanted is None or str(wanted) in (info.deviceId, info.name)]
+    matches = [info for info in available if device is None or str(device) in (info.deviceId, info.name)]
     if len(matches) == 1:
         return matches[0]
-    known = ", ".join(f"{info.deviceId} at {info.name}" for info in available) or "none"
-    shown = "null" if wanted is None else wanted
+    devices = ", ".join(f"{info.deviceId} at {info.name}" for info in available) or "none"
+    device_text = "null" if device is None else device
     raise DeviceNotFoundError(
-        f"{len(matches)} free OAK cameras match camera.device={shown} (free: {known}); check cable, power, "
+        f"{len(matches)} free OAK cameras match camera.device={device_text} (free: {devices}); check cable, power, "
         f"that the rules {UDEV_RULES} are installed, and that no other program uses it; of several, name one by its id"
     )

@@ -124,8 +124,8 @@ class UvcCamera(BackgroundCamera):
         height, width = image.shape[:2]
         left, top, side = crop_square(self._config, width, height)
         gray = cv2.cvtColor(image[top : top + side, left : left + side], cv2.COLOR_BGR2GRAY)
-        small: Gray = cv2.resize(gray, (self._config.side_px,) * 2, interpolation=cv2.INTER_AREA)
-        return RawFrame(stamp_ns - (self._config.exposure_us or 0) * 500, seq, small)
+        resized: Gray = cv2.resize(gray, (self._config.side_px,) * 2, interpolation=cv2.INTER_AREA)
+        return RawFrame(stamp_ns - (self._config.exposure_us or 0) * 500, seq, resized)
 
 
 def camera_names(sysfs: Path = _SYSFS) -> dict[str, str]:
@@ -159,9 +159,9 @@ def find_device(device: int | str, sysfs: Path = _SYSFS) -> Path:
     matches = [node for node, name in names.items() if name == device]
     if len(matches) == 1:
         return Path("/dev", matches[0])
-    known = ", ".join(f"{name!r} at /dev/{node}" for node, name in names.items()) or "none"
+    devices = ", ".join(f"{name!r} at /dev/{node}" for node, name in names.items()) or "none"
     raise DeviceNotFoundError(
-        f"{len(matches)} cameras have the name {device!r}; set camera.device to one of: {known}"
+        f"{len(matches)} cameras have the name {device!r}; set camera.device to one of: {devices}"
     )
 
 
@@ -214,12 +214,12 @@ def _set_controls(capture: Any, path: Path, config: CameraConfig) -> Settings:
             steps.append((automatic, off, 1, f"to stop automatic camera.{key}"))
         if value is not None:
             steps.append((control, value, unit, f"camera.{key}"))
-        for one, wanted, scale, what in steps:
-            capture.set(one, round(wanted / scale))
-            if abs((got := capture.get(one)) * scale - wanted) > _TOLERANCE * wanted:
-                read = "no such control" if got == _MISSING else f"{wanted} was set, {got * scale:g} is read"
+        for control_id, target, scale, purpose in steps:
+            capture.set(control_id, round(target / scale))
+            if abs((got := capture.get(control_id)) * scale - target) > _TOLERANCE * target:
+                text = "no such control" if got == _MISSING else f"{target} was set, {got * scale:g} is read"
                 raise DeviceError(
-                    f"{path} refuses {what}: {read}; set another value, or null (v4l2-ctl -d {path} -L lists its "
+                    f"{path} refuses {purpose}: {text}; set another value, or null (v4l2-ctl -d {path} -L lists its "
                     "controls and their ranges)"
                 )
         if (got := capture.get(control)) != _MISSING:

@@ -73,8 +73,8 @@ class WireFaults:
 
     def _corrupted(self, reply: bytes) -> bytes:
         """Changes one byte. With more, the CRC would miss one corruption in 65,536."""
-        at = self._random.randrange(len(reply))
-        return reply[:at] + bytes((reply[at] ^ self._random.randrange(1, 256),)) + reply[at + 1 :]
+        index = self._random.randrange(len(reply))
+        return reply[:index] + bytes((reply[index] ^ self._random.randrange(1, 256),)) + reply[index + 1 :]
 
 
 class _ActiveFault:
@@ -105,6 +105,6 @@ def _cut_power(servo: VirtualServo, t_ns: int) -> None:
 def _with_next_id(reply: bytes) -> bytes:
     """Returns the reply with the next id and a valid CRC; a fast reply has its id in the first block."""
     data = bytearray(reply[:-2])
-    at = 9 if data[4] == BROADCAST_ID else 4
-    data[at] = (data[at] + 1) % BROADCAST_ID
+    index = 9 if data[4] == BROADCAST_ID else 4
+    data[index] = (data[index] + 1) % BROADCAST_ID
     return bytes(data) + crc16(bytes(data)).to_bytes(2, "little")

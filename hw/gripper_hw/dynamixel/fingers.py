@@ -133,13 +133,13 @@ class FingerPair:
         self._goals_a = [goal_a, goal_a]
         slowest_rad_s, fastest_rad_s = sorted(direction * state.velocity_rad_s for state in self._states)
         if slowest_rad_s > -_STANDING_RAD_S and fastest_rad_s > _STANDING_RAD_S:
-            ahead = int(direction * half_rad > 0)
+            leader = int(direction * half_rad > 0)
             min_share = _MIN_SHARE if slowest_rad_s < _STANDING_RAD_S else _MIN_MOVING_SHARE
             share = 1 - abs(half_rad) / _EQUALISING_RAD
             shorter_rad = max(max(share, min_share) * abs(lead_rad), static_rad)
-            leads_rad[ahead] = min(max(leads_rad[ahead], -shorter_rad), shorter_rad)
-            left_a = max(goal_a - abs(self._states[ahead].current_a), 0.0)
-            self._goals_a[1 - ahead] = min(goal_a + (1 - max(share, 0.0)) * left_a, _MAX_CURRENT * goal_a)
+            leads_rad[leader] = min(max(leads_rad[leader], -shorter_rad), shorter_rad)
+            spare_a = max(goal_a - abs(self._states[leader].current_a), 0.0)
+            self._goals_a[1 - leader] = min(goal_a + (1 - max(share, 0.0)) * spare_a, _MAX_CURRENT * goal_a)
         if any(state.hardware_error & self._stopping_errors for state in self._states):
             self._goals_a = [0.0, 0.0]  # one finger alone would push the object and the other one away
         goals_rad = (

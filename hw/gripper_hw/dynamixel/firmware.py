@@ -183,8 +183,8 @@ class VirtualServo:
 
     def answers_group_read(self, *, fast: bool) -> bool:
         """Returns True if the servo answers a sync or bulk read; older firmware ignores the fast ones."""
-        known = not fast or self.get("firmware_version") >= self.model.fast_sync_read_firmware
-        return known and self.get("status_return_level") > 0
+        is_known = not fast or self.get("firmware_version") >= self.model.fast_sync_read_firmware
+        return is_known and self.get("status_return_level") > 0
 
     def read(self, address: int, size: int) -> tuple[Error, bytes]:
         """Reads bytes from a defined address on; gaps between registers read 0."""

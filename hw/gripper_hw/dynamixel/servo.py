@@ -187,12 +187,12 @@ class DynamixelBus:
         """
         fast = min(self.firmware, default=0) >= self.model.fast_sync_read_firmware
         read = partial(self._transport.sync_read, self.ids, fast=fast)
-        apart = self._read_size < CYCLE_BYTES
-        if apart and (not self._voltages or self.stats.cycles % VOLTAGE_CYCLES == 0):
+        has_voltage_apart = self._read_size < CYCLE_BYTES
+        if has_voltage_apart and (not self._voltages or self.stats.cycles % VOLTAGE_CYCLES == 0):
             self._voltages = read(_INDIRECT_ADDRESSES[_READ_BLOCK.size], _VOLTAGE.size)[1]
         t_ns, blocks = read(self._data_address, self._read_size)
         self.stats.cycles += 1
-        voltages = self._voltages if apart else [block[_READ_BLOCK.size :] for block in blocks]
+        voltages = self._voltages if has_voltage_apart else [block[_READ_BLOCK.size :] for block in blocks]
         return tuple(
             self._decode_state(t_ns, id_, block, voltage)
             for id_, block, voltage in zip(self.ids, blocks, voltages, strict=True)

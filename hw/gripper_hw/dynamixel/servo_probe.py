@@ -75,23 +75,23 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
             fast = latency_ms < servo.reply_margin_ms
             advice = f"copy {UDEV_RULES} to /etc/udev/rules.d: it sets the timer to 1 ms"
             yield judged("servo", "latency timer", f"{latency_ms} ms", fast, advice)
-        found = inspection.transport.scan()
-        for id_, (number, firmware) in sorted(found.items()):
+        answers = inspection.transport.scan()
+        for id_, (number, firmware) in sorted(answers.items()):
             if id_ not in servo.ids:
                 name = model_name(number) or f"model number {number}"
                 yield Check(f"servo {id_}", "model", f"{name}, firmware {firmware}", None)
         ready = True
         for id_ in servo.ids:
-            if id_ in found:
-                ready &= yield from inspection.checks(id_, *found[id_])
-        missing = [id_ for id_ in servo.ids if id_ not in found]
-        if not missing:
+            if id_ in answers:
+                ready &= yield from inspection.checks(id_, *answers[id_])
+        missing_ids = [id_ for id_ in servo.ids if id_ not in answers]
+        if not missing_ids:
             if ready:
-                yield from inspection.common_checks(config, min(found[id_][1] for id_ in servo.ids))
+                yield from inspection.common_checks(config, min(answers[id_][1] for id_ in servo.ids))
             return
-    answered = ", ".join(str(id_) for id_ in sorted(found)) or "none"
+    answered = ", ".join(str(id_) for id_ in sorted(answers)) or "none"
     found_text = f"no answer at {servo.baud_rate} baud (ids that answer: {answered})"
-    for id_ in missing:
+    for id_ in missing_ids:
         advice = f"check power, cable and {'servo.id' if id_ == servo.id else 'servo.second.id'}"
         if rate := _other_baud_rate(servo, id_):
             advice = f"it answers at {rate} baud: set servo.baud_rate={rate}"
@@ -171,11 +171,11 @@ class _Inspection:
                 "it, and try it once: stop a grasp with kill -9"
             )
             yield judged(unit, "watchdog", "unproven on this model", False, advice, harmless=True)
-        for name, new in self._expected.items():
-            if name in _ALWAYS_LISTED or values[name] != new:
-                same, text = values[name] == new, self._text(name, values[name])
-                advice = f"a run sets {self._text(name, new)}; so does doctor --setup"
-                yield judged(unit, name.replace("_", " "), text, same, advice, harmless=True)
+        for name, target in self._expected.items():
+            if name in _ALWAYS_LISTED or values[name] != target:
+                is_same, text = values[name] == target, self._text(name, values[name])
+                advice = f"a run sets {self._text(name, target)}; so does doctor --setup"
+                yield judged(unit, name.replace("_", " "), text, is_same, advice, harmless=True)
         return supported
 
     def common_checks(self, config: Config, firmware: int) -> Iterator[Check]:
@@ -197,10 +197,10 @@ class _Inspection:
             self.transport.sync_read(ids, start, size, fast=fast)
 
         median_ms, p99_ms = time_ms(cycle, _CYCLES)
-        found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
+        result = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
         rate_hz, lockstep = config.control.rate_hz, config.clock == "lockstep"
         advice = f"longer than a cycle at control.rate_hz={rate_hz:g}: close other programs, or lower it"
-        yield judged(unit, "bus cycle", found, p99_ms <= 1e3 / rate_hz, advice, harmless=lockstep)
+        yield judged(unit, "bus cycle", result, p99_ms <= 1e3 / rate_hz, advice, harmless=lockstep)
 
     def set_up(self, id_: int, confirm: Confirm, commission: bool) -> SetupResult:
         """Implements `setup`."""
@@ -210,11 +210,11 @@ class _Inspection:
             raise DeviceError(
                 f"servo {id_} has torque on, so nothing was changed; remove the object, then power-cycle it"
             )
-        wanted = self._commissioned(id_) if commission else self._expected
-        values = {name: self.transport.get(id_, name) for name in wanted}
-        differing = [name for name, new in wanted.items() if values[name] != new]
+        targets = self._commissioned(id_) if commission else self._expected
+        values = {name: self.transport.get(id_, name) for name in targets}
+        differing = [name for name, target in targets.items() if values[name] != target]
         changes = {
-            name: RegisterChange(name, self._text(name, values[name]), self._text(name, wanted[name]))
+            name: RegisterChange(name, self._text(name, values[name]), self._text(name, targets[name]))
             for name in differing
         }
         steps = [[name] for name in differing] if commission else [differing]
@@ -228,21 +228,21 @@ class _Inspection:
             self.transport.enable_replies(id_)
         for name in accepted:
             if name == "baud_rate":
-                self._change_baud_rate(id_, wanted[name])
+                self._change_baud_rate(id_, targets[name])
             else:
-                self.transport.set(id_, name, wanted[name])
+                self.transport.set(id_, name, targets[name])
         return SetupResult(id_, list(changes.values()), bool(accepted) and len(accepted) == len(differing))
 
     def _commissioned(self, id_: int) -> dict[str, int]:
         """Returns the EEPROM registers that a servo needs, the baud rate last."""
-        wanted = {name: new for name, new in self._expected.items() if REGISTERS[name].eeprom}
-        wanted["homing_offset"] = self._config.homing_offset
+        targets = {name: target for name, target in self._expected.items() if REGISTERS[name].eeprom}
+        targets["homing_offset"] = self._config.homing_offset
         present = self.transport.get(id_, "baud_rate")
         rate = next((rate for rate, code in BAUD_RATES.items() if code == present), 0)
         # A servo with another baud rate than the others on its bus would be lost to their program.
         if rate < FAST_BAUD_RATE and set(self.transport.scan()) == {id_}:
-            wanted["baud_rate"] = BAUD_RATES[FAST_BAUD_RATE]
-        return wanted
+            targets["baud_rate"] = BAUD_RATES[FAST_BAUD_RATE]
+        return targets
 
     def _change_baud_rate(self, id_: int, code: int) -> None:
         with suppress(DeviceTimeoutError):  # the reply may come at either rate

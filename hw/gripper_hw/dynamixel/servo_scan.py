@@ -52,12 +52,12 @@ def scan(config: Config, names: Iterable[str], progress: Progress = no_progress)
 
 def _scan_port(config: Config, name: str, progress: Progress) -> PortScan:
     baud_rates = tuple(BAUD_RATES)
-    found: dict[int, FoundServo] = {}
+    servos: dict[int, FoundServo] = {}
     problems: list[str] = []
     with ExitStack() as stack:
         if name.startswith(VIRTUAL_PREFIX):
-            alone = keep_only(config.with_values(servo={"port": name}), "servo")
-            stack.enter_context(open_devices(alone))
+            port_config = keep_only(config.with_values(servo={"port": name}), "servo")
+            stack.enter_context(open_devices(port_config))
             baud_rates = (config.servo.baud_rate,)  # bytes pass a virtual port at any rate
         for rate in baud_rates:
             progress(f"{name} at {rate} baud", 0)
@@ -70,10 +70,10 @@ def _scan_port(config: Config, name: str, progress: Progress) -> PortScan:
                 problems.append(str(error))
                 continue
             for id_, (number, firmware) in sorted(answers.items()):
-                if id_ not in found:  # a pseudo-terminal answers at every rate
-                    found[id_] = _servo(config, name, rate, id_, number, firmware)
-    unusable = len(problems) == len(baud_rates)
-    return PortScan(name, list(found.values()), problems[0] if unusable else "")
+                if id_ not in servos:  # a pseudo-terminal answers at every rate
+                    servos[id_] = _servo(config, name, rate, id_, number, firmware)
+    is_unusable = len(problems) == len(baud_rates)
+    return PortScan(name, list(servos.values()), problems[0] if is_unusable else "")
 
 
 def _servo(config: Config, port: str, baud_rate: int, id_: int, number: int, firmware: int) -> FoundServo:

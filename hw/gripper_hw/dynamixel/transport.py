@@ -153,8 +153,8 @@ class Transport:
 
     def scan(self) -> dict[int, tuple[int, int]]:
         """Returns id to model number and firmware of every servo that replies; a single attempt."""
-        found, _ = self._packets.broadcastPing(self._port)
-        return {id_: (number, firmware) for id_, (number, firmware) in found.items()}
+        answers, _ = self._packets.broadcastPing(self._port)
+        return {id_: (number, firmware) for id_, (number, firmware) in answers.items()}
 
     def sync_read(
         self, ids: Sequence[int], address: int, size: int, *, fast: bool = True

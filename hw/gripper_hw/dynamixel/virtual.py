@@ -168,7 +168,7 @@ def _sync_read(params: bytes) -> list[tuple[int, int, int]]:
 
 
 def _bulk_read(params: bytes) -> list[tuple[int, int, int]]:
-    return [(params[at], _word(params, at + 1), _word(params, at + 3)) for at in range(0, len(params) - 4, 5)]
+    return [(params[i], _word(params, i + 1), _word(params, i + 3)) for i in range(0, len(params) - 4, 5)]
 
 
 def _sync_write(params: bytes) -> list[tuple[int, int, bytes]]:
@@ -176,7 +176,7 @@ def _sync_write(params: bytes) -> list[tuple[int, int, bytes]]:
         return []
     address, step = _word(params, 0), _word(params, 2) + 1
     starts = range(4, len(params) - step + 1, step)
-    return [(params[at], address, params[at + 1 : at + step]) for at in starts]
+    return [(params[start], address, params[start + 1 : start + step]) for start in starts]
 
 
 def _bulk_write(params: bytes) -> list[tuple[int, int, bytes]]:
@@ -187,8 +187,8 @@ def _bulk_write(params: bytes) -> list[tuple[int, int, bytes]]:
     return writes
 
 
-def _word(data: bytes, at: int) -> int:
-    return data[at] | data[at + 1] << 8
+def _word(data: bytes, index: int) -> int:
+    return data[index] | data[index + 1] << 8
 
 
 _REPLY_LEVELS: Final[dict[int, int]] = {Instruction.PING: 0, Instruction.READ: 1}

@@ -50,12 +50,12 @@ def parse_hx711(line: bytes) -> Reading | None:
     Returns:
         The reading, or None if the line is not valid.
     """
-    found = _HX711.fullmatch(line)
-    if found is None:
+    match = _HX711.fullmatch(line)
+    if match is None:
         return None
-    if any(part is not None for part in found.groups()[1:]):
-        return Reading(float(found[1] + (found[2] or b"")), rounded=True)
-    if not HX711_MIN <= (raw := int(found[1])) <= HX711_MAX:
+    if any(group is not None for group in match.groups()[1:]):
+        return Reading(float(match[1] + (match[2] or b"")), rounded=True)
+    if not HX711_MIN <= (raw := int(match[1])) <= HX711_MAX:
         return None
     return Reading(float(raw), saturated=raw in (HX711_MIN, HX711_MAX))
 
@@ -70,10 +70,10 @@ def parse_cas(line: bytes) -> Reading | None:
     Returns:
         The reading, or None if the line is not valid.
     """
-    found = _CAS.fullmatch(line.removesuffix(b"\r"))
-    if found is None or len(found[0]) not in _CAS_LENGTHS:
+    match = _CAS.fullmatch(line.removesuffix(b"\r"))
+    if match is None or len(match[0]) not in _CAS_LENGTHS:
         return None
-    state, data, unit = found.groups()
+    state, data, unit = match.groups()
     number = _DECIMAL.fullmatch(data)
     if number is None:
         return Reading(math.nan, saturated=True, rounded=True) if state == b"OL" else None

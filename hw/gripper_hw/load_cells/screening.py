@@ -102,23 +102,23 @@ class SampleValidator:
         """Returns the samples that were not taken yet and can be checked at ``now_ns``, oldest first."""
         while self._added:
             self._waiting.append(self._added.popleft())
-        ready = self._ready_count(now_ns)
-        if not ready:
+        count = self._ready_count(now_ns)
+        if not count:
             return []
         candidates_n = [sample.force_n for sample in self._waiting if sample.valid]
         spikes = iter(find_spikes(np.array([*self._previous_n, *candidates_n]))[len(self._previous_n) :])
-        taken, self._waiting = self._waiting[:ready], self._waiting[ready:]
-        for i, sample in enumerate(taken):
+        samples, self._waiting = self._waiting[:count], self._waiting[count:]
+        for i, sample in enumerate(samples):
             if sample.valid:
                 self._previous_n.append(sample.force_n)
                 if next(spikes):
                     self.stats.spikes += 1
-                    taken[i] = replace(sample, valid=False)
-            self._rejected.append(not taken[i].valid)
-            if taken[i].valid and sum(self._rejected) > MAX_REJECTED_SHARE * REJECTION_WINDOW_SAMPLES:
+                    samples[i] = replace(sample, valid=False)
+            self._rejected.append(not samples[i].valid)
+            if samples[i].valid and sum(self._rejected) > MAX_REJECTED_SHARE * REJECTION_WINDOW_SAMPLES:
                 self.stats.doubtful += 1
-                taken[i] = replace(sample, valid=False)
-        return taken
+                samples[i] = replace(sample, valid=False)
+        return samples
 
     def counts(self) -> dict[str, int]:
         """Counters by name (see `LoadCellStats`)."""
@@ -126,13 +126,13 @@ class SampleValidator:
 
     def _ready_count(self, now_ns: int) -> int:
         """Number of waiting samples that have enough followers, or waited `MAX_WAIT_NS` for them."""
-        ready, followers = len(self._waiting), 0
-        for i in reversed(range(ready)):
+        count, followers = len(self._waiting), 0
+        for i in reversed(range(count)):
             if self._waiting[i].valid:
                 if followers < HAMPEL_HALF_WINDOW and now_ns - self._waiting[i].t_ns <= MAX_WAIT_NS:
-                    ready = i
+                    count = i
                 followers += 1
-        return ready
+        return count
 
 
 class LiveLoadCell:

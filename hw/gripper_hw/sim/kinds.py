@@ -255,8 +255,8 @@ class Shell(ObjectKind):
             points[:, 2] += skin
             pins = np.flatnonzero(points[:, 2] < skin + 2e-4)
         # Stiffness of a ring is proportional to E * thickness^3 * length / radius^3.
-        young = self.modulus_pa * stiffness * size**2
-        body = shell(points, uv, faces, pins, young, thickness=self.wall_m, damping=0.004, radius=skin)
+        young_pa = self.modulus_pa * stiffness * size**2
+        body = shell(points, uv, faces, pins, young_pa, thickness=self.wall_m, damping=0.004, radius=skin)
         height = lengths[0] if self.lying else lengths[2]
         return self._model(body, SHELL_CONTACT, height, dt)
 
@@ -301,16 +301,16 @@ class Spring(ObjectKind):
         arm = {None: 1.0, "back": depth / 2, "foot": height * self.grip}[self.hinge]
         parts = ""
         for side in (-1, 1):
-            at = np.array([side * (width / 2 - half[0]), 0, height * (0.5 - self.grip)])
-            hinge = {None: [0, 0, 0], "back": [at[0], arm, 0], "foot": [at[0], 0, -arm]}[self.hinge]
+            centre = np.array([side * (width / 2 - half[0]), 0, height * (0.5 - self.grip)])
+            hinge = {None: [0, 0, 0], "back": [centre[0], arm, 0], "foot": [centre[0], 0, -arm]}[self.hinge]
             axis = {None: [-side, 0, 0], "back": [0, 0, -side], "foot": [0, -side, 0]}[self.hinge]
             joint = "slide" if self.hinge is None else "hinge"
             travel = gap if self.hinge is None else np.rad2deg(gap / arm)
-            place = numbers(hinge)
-            parts += f"""<body><joint type="{joint}" axis="{numbers(axis)}" pos="{place}" range="-.001 {travel:.6g}"
+            pivot = numbers(hinge)
+            parts += f"""<body><joint type="{joint}" axis="{numbers(axis)}" pos="{pivot}" range="-.001 {travel:.6g}"
               stiffness="{linear * arm**2:.6g} 0 {cubic * arm**4:.6g}" damping="{6 * arm**2:.6g}"
               armature="{0.03 * arm**2:.6g}" solreflimit=".006 1"/>
-              {_geom(self.shape, half, at, f'material="object" mass=".03" {_RIGID}')}</body>"""
+              {_geom(self.shape, half, centre, f'material="object" mass=".03" {_RIGID}')}</body>"""
         rod = _geom(
             "box",
             np.array([width / 2 - half[0], depth * 0.2, height * 0.2]),
@@ -367,7 +367,7 @@ def _mesh_shape(mesh: MeshFile, size: float) -> tuple[Points, Indices, Points]:
     return points, outward(points, tetrahedra[volumes > 1e-9]), size_m * size
 
 
-def _geom(shape: str, half: Points, at: Points, rest: str) -> str:
+def _geom(shape: str, half: Points, centre: Points, attributes: str) -> str:
     """Returns a geom that fills a box, with half its lengths."""
     x, y, z = half
     if shape in ("box", "ball"):
@@ -376,4 +376,4 @@ def _geom(shape: str, half: Points, at: Points, rest: str) -> str:
         kind, size, turn = "cylinder", np.array([min(x, z), y]), 'euler="90 0 0"'
     else:
         kind, size, turn = "cylinder", np.array([min(x, y), z]), ""
-    return f'<geom type="{kind}" size="{numbers(size)}" pos="{numbers(at)}" {turn} {rest}/>'
+    return f'<geom type="{kind}" size="{numbers(size)}" pos="{numbers(centre)}" {turn} {attributes}/>'

@@ -126,7 +126,7 @@ def shell(
     uv: Points,
     faces: Indices,
     pins: Indices,
-    young: float,
+    young_pa: float,
     *,
     thickness: float,
     damping: float,
@@ -136,7 +136,7 @@ def shell(
     return f"""<flexcomp name="object" type="direct" dim="2" mass=".2" radius="{radius}" material="object"
       point="{numbers(points)}" element="{numbers(faces)}" texcoord="{numbers(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {SHELL_CONTACT}/>
-      <elasticity young="{young:.6g}" poisson=".3" thickness="{thickness}" damping="{damping}"
+      <elasticity young="{young_pa:.6g}" poisson=".3" thickness="{thickness}" damping="{damping}"
                   elastic2d="both"/>
       <pin id="{numbers(pins)}"/></flexcomp>"""
 

@@ -57,29 +57,29 @@ def read_object(path: Path) -> ObjectKind | MjcfBody:
 
 def digest(path: Path) -> str:
     """Returns the SHA-256 of an object's file and of the files that it names."""
-    kind, parts = read_object(path), [path.read_bytes()]
+    kind, contents = read_object(path), [path.read_bytes()]
     if isinstance(kind, MjcfBody):
         spec = _read_spec(path)
-        if re.search(rb"<(include|model)\s", parts[0]):
-            parts.append(spec.to_xml().encode())
-        parts += [data for _, data in sorted(_mjcf_files(spec).items())]
+        if re.search(rb"<(include|model)\s", contents[0]):
+            contents.append(spec.to_xml().encode())
+        contents += [data for _, data in sorted(_mjcf_files(spec).items())]
     else:
         mesh = getattr(kind, "mesh", None)
-        named = [kind.texture] if kind.texture.endswith(".png") else []
-        named += [] if mesh is None else [mesh.file]
-        parts += [read_bytes(Path(name), "file") for name in named]
-    return hashlib.sha256(b"".join(parts)).hexdigest()
+        files = [kind.texture] if kind.texture.endswith(".png") else []
+        files += [] if mesh is None else [mesh.file]
+        contents += [read_bytes(Path(name), "file") for name in files]
+    return hashlib.sha256(b"".join(contents)).hexdigest()
 
 
 def attach(scene: str, model: ObjectModel, images: dict[str, bytes]) -> str:
     """Returns the MJCF of a scene, whose images are given, with a user's body in its body ``object``."""
     try:
-        whole, spec = mujoco.MjSpec.from_string(scene), model.spec
-        whole.assets = images | model.files
+        scene_spec, spec = mujoco.MjSpec.from_string(scene), model.spec
+        scene_spec.assets = images | model.files
         with warnings.catch_warnings():  # of options of the file, which the scene replaces
             warnings.simplefilter("ignore", UserWarning)
-            whole.body("object").add_frame().attach_body(spec.body("object"), _PREFIX, "")
-            return str(whole.to_xml())
+            scene_spec.body("object").add_frame().attach_body(spec.body("object"), _PREFIX, "")
+            return str(scene_spec.to_xml())
     except ValueError as error:
         raise ConfigError(
             f"MuJoCo can't put the simulated object into the scene: {' '.join(str(error).split())}; correct its file"
@@ -115,8 +115,8 @@ def _read_spec(path: Path) -> Any:
             geom.conaffinity & 1 or geom.contype & 1 for geom in spec.geoms
         ),
     }
-    if missing := [text for text, is_wrong in wrong.items() if is_wrong]:
-        raise ConfigError(f"the simulated object {path} needs {'; and '.join(missing)}")
+    if needs := [text for text, is_wrong in wrong.items() if is_wrong]:
+        raise ConfigError(f"the simulated object {path} needs {'; and '.join(needs)}")
     _compile(spec, path)
     return spec
 

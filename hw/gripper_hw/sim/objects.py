@@ -63,10 +63,10 @@ def build_object(
         return OBJECTS[name](detail, size, stiffness)
     if name in (kinds := load_kinds()):
         return kinds[name].build(detail, size, stiffness)
-    known = [*OBJECTS, *kinds, NO_OBJECT]
-    hint = "".join(f"; did you mean {close!r}?" for close in get_close_matches(name.lower(), known, 1, 0.7))
+    names = [*OBJECTS, *kinds, NO_OBJECT]
+    hint = "".join(f"; did you mean {close!r}?" for close in get_close_matches(name.lower(), names, 1, 0.7))
     raise ConfigError(
-        f"no simulated object {name!r}{hint}; there are {', '.join(known)}, or the path of a file of your own that "
+        f"no simulated object {name!r}{hint}; there are {', '.join(names)}, or the path of a file of your own that "
         "ends in .yaml or .xml"
     )
 
@@ -96,12 +96,12 @@ def _sponge(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     grid = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3) * spacing
     uv = np.c_[grid[:, 0] + 0.5 * grid[:, 1], grid[:, 2] + 0.5 * grid[:, 1]] / 0.1
     nodes = 1 if order == "trilinear" else 2
-    young = 1.5e4 * stiffness / size  # stiffness of a block is proportional to E * area / length
+    young_pa = 1.5e4 * stiffness / size  # stiffness of a block is proportional to E * area / length
     body = f"""<flexcomp name="object" type="grid" dim="3" count="{numbers(counts)}" spacing="{numbers(spacing)}"
       dof="{order}" cellcount="{numbers(cells)}" pos="0 0 {lengths[2] / 2 + 0.001:.6g}" mass=".2" radius=".001"
       material="object" flatskin="true" texcoord="{numbers(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {contact}/>
-      <elasticity young="{young:.6g}" poisson=".2" damping=".01"/>
+      <elasticity young="{young_pa:.6g}" poisson=".2" damping=".01"/>
       <pin gridrange="0 0 0 {nodes * cells[0]} {nodes * cells[1]} 0"/></flexcomp>"""
     return ObjectModel(body, contact, "sponge.png", 0.030 * size, dt)
 
@@ -115,8 +115,8 @@ def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     # Pins a strip: a single pinned line would act as a hinge.
     pins = np.flatnonzero(points[:, 2] < 0.0012 + radius * (1 - np.cos(np.deg2rad(24))))
     # Stiffness of a ring is proportional to E * thickness^3 * length / radius^3.
-    young = 3.0e7 * stiffness * size**2
-    body = shell(points, uv, faces, pins, young, thickness=0.0022, damping=0.004, radius=0.0012)
+    young_pa = 3.0e7 * stiffness * size**2
+    body = shell(points, uv, faces, pins, young_pa, thickness=0.0022, damping=0.004, radius=0.0012)
     return ObjectModel(body, SHELL_CONTACT, "tube.png", 0.022 * size, dt)
 
 
@@ -128,8 +128,8 @@ def _cup(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     uv[:, 1] = 1 - uv[:, 1]
     points[:, 2] += 0.0008
     pins = np.flatnonzero(points[:, 2] < 0.001)
-    young = 1.5e8 * stiffness * size**2
-    body = shell(points, uv, faces, pins, young, thickness=0.0011, damping=0.003, radius=0.0008)
+    young_pa = 1.5e8 * stiffness * size**2
+    body = shell(points, uv, faces, pins, young_pa, thickness=0.0011, damping=0.003, radius=0.0008)
     return ObjectModel(body, SHELL_CONTACT, "cup.png", 0.060 * size, dt)
 
 
@@ -186,16 +186,16 @@ def _ball(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     radius = 0.024 * size
     points, tetrahedra = solid_ball(cells)
     # The angle from the front direction is the distance from the texture's centre.
-    across = points[:, [0, 2]] / np.maximum(np.hypot(points[:, 0], points[:, 2]), 1e-9)[:, None]
-    uv = 0.5 + across * (np.arccos(np.clip(-points[:, 1], -1, 1)) / (2 * np.pi))[:, None]
+    direction = points[:, [0, 2]] / np.maximum(np.hypot(points[:, 0], points[:, 2]), 1e-9)[:, None]
+    uv = 0.5 + direction * (np.arccos(np.clip(-points[:, 1], -1, 1)) / (2 * np.pi))[:, None]
     points = points * radius + [0, 0, radius + 0.001]
     pins = np.flatnonzero(points[:, 2] < 0.001 + 0.15 * radius)
     # The exponent is between 1 (a block) and 1/2 (two spheres in point contact).
-    young = 9.0e4 * stiffness / size**0.75
+    young_pa = 9.0e4 * stiffness / size**0.75
     body = f"""<flexcomp name="object" type="direct" dim="3" mass=".2" radius=".001" material="object"
       point="{numbers(points)}" element="{numbers(tetrahedra)}" texcoord="{numbers(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {SHELL_CONTACT}/>
-      <elasticity young="{young:.6g}" poisson=".2" damping=".01"/>
+      <elasticity young="{young_pa:.6g}" poisson=".2" damping=".01"/>
       <pin id="{numbers(pins)}"/></flexcomp>"""
     return ObjectModel(body, SHELL_CONTACT, "ball.png", radius, dt)
 

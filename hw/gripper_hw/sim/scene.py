@@ -222,20 +222,20 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
     )
 
 
-def _of_rig(drawn: Scene, config: SimConfig) -> Scene:
+def _of_rig(scene: Scene, config: SimConfig) -> Scene:
     """Returns a scene with camera, jaws and light of a configuration; what was drawn is a deviation from them."""
     camera, jaws, light = config.camera, config.jaws, config.light
     shift = np.array(light.direction) - Scene.light_direction
-    ambient = drawn.light_ambient + (light.ambient - Scene.light_ambient)
+    ambient = scene.light_ambient + (light.ambient - Scene.light_ambient)
     return replace(
-        drawn,
+        scene,
         camera_from_grip_m=camera.position_m,
         camera_aim_m=camera.aim_m,
-        camera_fovy_deg=drawn.camera_fovy_deg * (camera.fov_deg / Scene.camera_fovy_deg),
+        camera_fovy_deg=scene.camera_fovy_deg * (camera.fov_deg / Scene.camera_fovy_deg),
         camera_roll_deg=camera.roll_deg,
         camera_blur_px=camera.blur_px,
-        shot_noise=drawn.shot_noise if camera.noise is None else camera.noise,
-        light_direction=tuple((np.array(drawn.light_direction) + shift).tolist()),
+        shot_noise=scene.shot_noise if camera.noise is None else camera.noise,
+        light_direction=tuple((np.array(scene.light_direction) + shift).tolist()),
         light_ambient=min(max(ambient, 0.0), 1.0),
         pad_half_m=(jaws.pad_m[0] / 2, jaws.pad_m[1] / 2),
         finger_half_m=jaws.finger_m / 2,
@@ -399,9 +399,9 @@ def _marker(scene: Scene, side: int) -> str:
     """Plate on a jaw, at the position of a pad's finger: nearer to the object it would hide the contact."""
     if not scene.markers:
         return ""
-    place = numbers([side * _FINGER_X_M["pads"], -0.0125, 0.0])
+    position = numbers([side * _FINGER_X_M["pads"], -0.0125, 0.0])
     return (
-        f'<geom type="box" size=".008 .008 .0003" euler="90 0 0" pos="{place}" contype="0" conaffinity="0" '
+        f'<geom type="box" size=".008 .008 .0003" euler="90 0 0" pos="{position}" contype="0" conaffinity="0" '
         f'mass="0" material="marker_{(side + 1) // 2}"/>'
     )
 

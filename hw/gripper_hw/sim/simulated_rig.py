@@ -309,15 +309,15 @@ class SimulatedRig:
 
     def notes(self) -> dict[str, str]:
         """Facts for the log: set, the scene's parameters, the exposure, and the digest of a user's object file."""
-        second = {} if self._second is None else {"second finger": json.dumps(asdict(self._second))}
+        finger_notes = {} if self._second is None else {"second finger": json.dumps(asdict(self._second))}
         file = self._config.sim.object
-        own = {} if file is None else {"object file": str(file), "object file sha256": self._object_digest}
+        files = {} if file is None else {"object file": str(file), "object file sha256": self._object_digest}
         return {
             "set": f"{self._config.object}-{self._config.seed}",  # logs of one scene
             "scene": json.dumps(asdict(self.scene)),
             "exposure_ms": str(self._exposure_ms),
-            **second,
-            **own,
+            **finger_notes,
+            **files,
         }
 
     def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:

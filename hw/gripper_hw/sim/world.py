@@ -179,8 +179,8 @@ class World:
         self.step_ns = round(self._model.opt.timestep * NS_PER_S)
         drives = {"servo": (motor, scene)} | ({} if second is None else {"second_servo": second})
         self._drives = [
-            _Drive(one, of, nm_per_a * of.nm_per_a, 2 // len(drives), *self._addresses(name))
-            for name, (one, of) in drives.items()
+            _Drive(motor_, scene_, nm_per_a * scene_.nm_per_a, 2 // len(drives), *self._addresses(name))
+            for name, (motor_, scene_) in drives.items()
         ]
         # The scene has pinions; another linkage acts between a horn and its pinion.
         linkage = make_linkage(gripper)
