@@ -98,11 +98,11 @@ def select_exposure(candidates: Sequence[ExposureCandidate]) -> ExposureCandidat
     """
     usable = [candidate for candidate in candidates if candidate.usable]
     if not usable:
-        measured = ", ".join(
+        measurements = ", ".join(
             f"{c.text}: mean {c.mean:.0f}, {100 * c.clipped:.1f} % clipped" for c in candidates
         )
         raise DataError(
-            f"the image is dark or clipped at every exposure ({measured}); change the light, the gain or the "
+            f"the image is dark or clipped at every exposure ({measurements}); change the light, the gain or the "
             "aperture, or pass other exposures with --exposure-us"
         )
     return nearest_exposure(usable)
@@ -121,8 +121,8 @@ def find_markers(gray: Gray) -> Markers:
     corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(large)
     if numbers is None:
         return {}
-    found = {int(n): c.reshape(4, 2) for n, c in zip(np.ravel(numbers), corners, strict=True)}
-    return {n: (c.astype(np.float64) + 0.5) / factor - 0.5 for n, c in found.items() if n in MARKERS}
+    markers = {int(n): c.reshape(4, 2) for n, c in zip(np.ravel(numbers), corners, strict=True)}
+    return {n: (c.astype(np.float64) + 0.5) / factor - 0.5 for n, c in markers.items() if n in MARKERS}
 
 
 def region_around(markers_by_image: Sequence[Markers], width: int, height: int) -> Region:

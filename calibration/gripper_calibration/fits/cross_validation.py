@@ -102,10 +102,10 @@ def cross_validate(touches: Touches, coverage: float) -> CrossValidation:
             by_touch_n, inside = estimate_left_out(alone_n, measured, coverage)
     result_n = np.empty(len(touches.touch))
     for k, number in enumerate(numbers):
-        own = touches.touch == number
-        result_n[own] = by_touch_n[k]
+        is_own = touches.touch == number
+        result_n[is_own] = by_touch_n[k]
         if within is not None:
-            within[own] = inside[k]
+            within[is_own] = inside[k]
     return CrossValidation(
         selected=selected,
         errors_n={c.name: float(e) for c, e in zip(CANDIDATES, error_n.mean(0), strict=True)},

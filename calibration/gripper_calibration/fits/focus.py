@@ -25,8 +25,8 @@ def blur(gray: Gray) -> float:
 
 def _along(image: np.ndarray) -> float:
     """Blur along the first axis."""
-    again = cv2.blur(image, (1, _TAPS), borderType=cv2.BORDER_REFLECT)
-    steps, steps_again = np.abs(np.diff(image, axis=0)), np.abs(np.diff(again, axis=0))
+    reblurred = cv2.blur(image, (1, _TAPS), borderType=cv2.BORDER_REFLECT)
+    steps, steps_again = np.abs(np.diff(image, axis=0)), np.abs(np.diff(reblurred, axis=0))
     total = float(steps.sum())
     if total == 0.0:
         return 1.0

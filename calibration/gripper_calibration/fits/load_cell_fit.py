@@ -149,7 +149,7 @@ def rest_statistics(rest: Rest, scale: float, name: str, step_raw: float = math.
 
 
 def fit_load_cell(
-    empty: Rest, loaded: Rest, again: Rest, force_n: float, step_raw: float = math.inf
+    empty: Rest, loaded: Rest, empty_again: Rest, force_n: float, step_raw: float = math.inf
 ) -> LoadCellFit:
     """Fits tare and scale to three rests.
 
@@ -159,7 +159,7 @@ def fit_load_cell(
     Args:
         empty: Readings without load.
         loaded: Readings under the force.
-        again: Readings after the load was removed.
+        empty_again: Readings after the load was removed.
         force_n: The force, positive.
         step_raw: As for `rest_statistics`.
 
@@ -170,7 +170,7 @@ def fit_load_cell(
     rough = _rough_scale(empty, loaded, force_n)
     first = rest_statistics(empty, rough, "without load", step_raw)
     under = rest_statistics(loaded, rough, "under load", step_raw)
-    last = rest_statistics(again, rough, "after unloading", step_raw)
+    last = rest_statistics(empty_again, rough, "after unloading", step_raw)
     change = under.raw - (first.raw + last.raw) / 2
     unit = "units of the reading"
     largest = max(first.half_raw, under.half_raw, last.half_raw, force_n / _MAX_RAW)
@@ -208,7 +208,7 @@ def fit_load_cell(
     drift_half = float(np.hypot(first.drift_half_raw_min, last.drift_half_raw_min)) / 2 * abs(n_per_raw)
     statistics = (first, under, last)
     return LoadCellFit(
-        rests=(empty, loaded, again),
+        rests=(empty, loaded, empty_again),
         tare_raw=CalibratedValue(value=tare, low=tare - tare_half, high=tare + tare_half),
         n_per_raw=CalibratedValue(value=n_per_raw, low=ends[0], high=ends[1]),
         noise_n=max(one.noise_raw for one in statistics) * abs(n_per_raw),

@@ -41,10 +41,10 @@ def fit_object_ood(touches: Touches, model: OodModel) -> KnownFrames:
     parts = [touches.only([number]) for number in numbers]
     if len(numbers) < MIN_TOUCHES:
         worst = [np.quantile(OodScore(model).score(p.features, p.estimate_n), _QUANTILE) for p in parts]
-        known = known_frames(model)
+        frames = known_frames(model)
         widened = max(1.0, _margin(len(parts)) * float(max(worst)))
-        return known._replace(
-            limits=tuple(one.model_copy(update={"limit": widened * one.limit}) for one in known.limits)
+        return frames._replace(
+            limits=tuple(one.model_copy(update={"limit": widened * one.limit}) for one in frames.limits)
         )
     return KnownFrames(*object_subspace(touches), object_limits(*left_out_shares(touches)))
 

@@ -190,7 +190,7 @@ def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal
     n_per_a, friction_n, share, offset_a, lag_s = statics.values
     half, used, force_n = statics.half, statics.used, statics.force_n
     free, free_half, travelled = _fit_travel(passes, n_per_a, half[0], nominal.pinion_radius_m)
-    radius, opening, given = _fit_geometry(rows, nominal)
+    radius, opening, is_radius_given = _fit_geometry(rows, nominal)
     nm = n_per_a * 2 * radius[0]
     nm_half = float(np.hypot(half[0] * 2 * radius[0], n_per_a * 2 * radius[1]))
     # The passes were converted to metres with the nominal radius; damping is force over speed.
@@ -207,7 +207,7 @@ def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal
         lag_s=_estimate(lag_s, half[4]),
         free_friction_n=_estimate(free[0], free_half[0]),
         damping_n_s_m=_estimate(damping, damping_half),
-        pinion_radius_m=CalibratedValue(value=radius[0]) if given else _estimate(*radius),
+        pinion_radius_m=CalibratedValue(value=radius[0]) if is_radius_given else _estimate(*radius),
         open_position_rad=_estimate(*opening),
         force_n=(float(force_n.min()), float(force_n.max())),
         speed_m_s=(
@@ -328,8 +328,8 @@ def _fit_geometry(rows: Floats, nominal: Nominal) -> tuple[tuple[float, float], 
     used = (side < 0) | (force > force.max() / 3)
     closed_m = nominal.open_width_m - gauge  # closing travel at contact
     elastic = np.column_stack([np.ones(len(rows)), force, force**2, force**3, rate])[used]
-    given = len(np.unique(gauge)) == 1
-    if given:
+    is_radius_given = len(np.unique(gauge)) == 1
+    if is_radius_given:
         target = closing - closed_m / (2 * nominal.pinion_radius_m)
         _, regression, _ = _robust_fit(Regression(elastic, target[used], number[used]), "jaws' angle")
         values, half = _jackknife(regression, lambda b: b[:1], between=1)

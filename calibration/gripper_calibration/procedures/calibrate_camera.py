@@ -146,7 +146,7 @@ def calibrate_camera(
             "set the backend of yours"
         )
     rig_to_update(rig)  # raises if it can't be read or written
-    before = config
+    old_config = config
     config = config.with_values(
         calibration={"rig": None, "object": None},  # their camera settings are replaced
         vision={"region": region},
@@ -154,16 +154,16 @@ def calibrate_camera(
     candidates, images = try_exposures(config, exposures_us or candidate_exposures_us(config), progress)
     selected = select_exposure(candidates)
     config = config.with_values(camera={"exposure_us": selected.exposure_us})
-    with TemporaryDirectory() as aside:
-        (log,) = record(config, RecordingPlan(1, touches), Path(aside), progress)
-        observed = observe(log, region)
-    height, width = observed.reference.shape
-    found_region = region_around(observed.markers, width, height) if region is None else region
-    lag = estimate_lag(observed.touches)
-    computing_ms = compute_ms(config.with_values(vision={"region": found_region}), observed.reference)
-    wait_ms = observed.use_ms + computing_ms + 500 / observed.rate_hz
+    with TemporaryDirectory() as temporary_folder:
+        (log,) = record(config, RecordingPlan(1, touches), Path(temporary_folder), progress)
+        evaluation = observe(log, region)
+    height, width = evaluation.reference.shape
+    found_region = region_around(evaluation.markers, width, height) if region is None else region
+    lag = estimate_lag(evaluation.touches)
+    computing_ms = compute_ms(config.with_values(vision={"region": found_region}), evaluation.reference)
+    wait_ms = evaluation.use_ms + computing_ms + 500 / evaluation.rate_hz
     camera = config.camera
-    found = CameraCalibration(
+    calibration = CameraCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
         backend=camera.backend,
         side_px=camera.side_px,
@@ -179,41 +179,49 @@ def calibrate_camera(
         delay_ms=_shifted(lag, wait_ms),
         reference=f"{rig.stem}-reference.png",
     )
-    update_rig(rig, found)
-    _write(rig.with_name(found.reference), observed.reference)
+    update_rig(rig, calibration)
+    _write(rig.with_name(calibration.reference), evaluation.reference)
     report = rig.with_name(f"{rig.stem}-camera.png")
-    draw(found, observed.widest, observed.widest_markers, candidates, images, observed.touches, report)
-    correlations_ms = [touch.correlation_ms for touch in usable_touches(observed.touches)]
+    draw(
+        calibration,
+        evaluation.widest,
+        evaluation.widest_markers,
+        candidates,
+        images,
+        evaluation.touches,
+        report,
+    )
+    correlations_ms = [touch.correlation_ms for touch in usable_touches(evaluation.touches)]
     return CameraResult(
-        calibration=found,
+        calibration=calibration,
         correlation_lag_ms=float(np.nanmedian(correlations_ms)),
-        use_ms=observed.use_ms,
+        use_ms=evaluation.use_ms,
         compute_ms=computing_ms,
-        touches=len(observed.touches),
+        touches=len(evaluation.touches),
         touches_that_tell=len(correlations_ms),
         rig=rig,
         report=report,
-        outdated=_outdated(before, config.with_values(vision={"region": found_region})),
+        outdated=_outdated(old_config, config.with_values(vision={"region": found_region})),
     )
 
 
-def _outdated(before: Config, after: Config) -> tuple[str, ...]:
-    """Names the profiles and the network that match the camera settings of ``before``, but not those of ``after``."""
-    made: list[tuple[str, Callable[[Tree], list[str]]]] = []
+def _outdated(old: Config, new: Config) -> tuple[str, ...]:
+    """Names the profiles and the network that match the camera settings of ``old``, but not those of ``new``."""
+    checks: list[tuple[str, Callable[[Tree], list[str]]]] = []
     for path in sorted([*user_folder().glob("*.yaml"), *user_folder().glob(f"*/{BUNDLED}")]):
         try:
             camera = read_object(path).camera
         except ConfigError:  # damaged: a run with it says so
             continue
-        made.append(
+        checks.append(
             (f"the {'bundle' if path.name == BUNDLED else 'profile'} {path}", partial(differences, camera))
         )
-    if (model := resolve_vision(before)[1]) is not None:
-        made.append((f"the network {model.path}", model.header.mismatches))
+    if (model := resolve_vision(old)[1]) is not None:
+        checks.append((f"the network {model.path}", model.header.mismatches))
     return tuple(
-        f"{name} ({', '.join(found)})"
-        for name, differ in made
-        if (found := differ(after.rig_settings())) and not differ(before.rig_settings())
+        f"{name} ({', '.join(mismatches)})"
+        for name, find_mismatches in checks
+        if (mismatches := find_mismatches(new.rig_settings())) and not find_mismatches(old.rig_settings())
     )
 
 

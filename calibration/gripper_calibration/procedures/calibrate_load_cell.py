@@ -94,7 +94,7 @@ def calibrate_load_cell(
     with closing(cell):
         cell.start()
         fit = weigh(cell, clock, force_n, prompt=prompt, seconds=seconds, progress=progress)
-    found = LoadCellCalibration(
+    calibration = LoadCellCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
         sensor=section.sensor,
         tare_raw=fit.tare_raw,
@@ -103,10 +103,10 @@ def calibrate_load_cell(
         noise_n=fit.noise_n,
         drift_n_min=fit.drift_n_min,
     )
-    update_rig(rig, found)
+    update_rig(rig, calibration)
     report = rig.with_name(f"{rig.stem}-load-cell.png")
     draw(fit, report)
-    return LoadCellResult(found, fit.return_n, fit.rejected, rig, report)
+    return LoadCellResult(calibration, fit.return_n, fit.rejected, rig, report)
 
 
 def weigh(
@@ -145,12 +145,13 @@ def weigh(
     def is_loaded(rest: Rest) -> bool:
         try:
             tare = rest_statistics(empty, 0.0, "without load", reader.step_raw)
-            now = rest_statistics(rest, 0.0, "under load", reader.step_raw)
+            present = rest_statistics(rest, 0.0, "under load", reader.step_raw)
         except DataError:
             return False
-        change = abs(now.raw - tare.raw)
+        change = abs(present.raw - tare.raw)
         return bool(
-            change > _MIN_CHANGE * (now.half_raw + tare.half_raw) and now.range_raw < _MAX_RANGE * change
+            change > _MIN_CHANGE * (present.half_raw + tare.half_raw)
+            and present.range_raw < _MAX_RANGE * change
         )
 
     loaded = reader.read("loaded", is_loaded)
@@ -158,14 +159,16 @@ def weigh(
 
     def is_unloaded(rest: Rest) -> bool:
         try:
-            now = rest_statistics(rest, 0.0, "after unloading")
+            present = rest_statistics(rest, 0.0, "after unloading")
         except DataError:
             return False
-        return bool(abs(now.raw - tare_raw) < _MAX_RANGE * change and now.range_raw < _MAX_RANGE * change)
+        return bool(
+            abs(present.raw - tare_raw) < _MAX_RANGE * change and present.range_raw < _MAX_RANGE * change
+        )
 
     prompt("Take the mass off again")
-    again = reader.read("empty again", is_unloaded)
-    return fit_load_cell(empty, loaded, again, force_n, reader.step_raw)
+    empty_again = reader.read("empty again", is_unloaded)
+    return fit_load_cell(empty, loaded, empty_again, force_n, reader.step_raw)
 
 
 class _RestReader:

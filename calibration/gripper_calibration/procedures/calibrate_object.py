@@ -109,7 +109,7 @@ class ObjectCalibration:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Network, engine and place of a calibration, open and checked before its touches.
+    """Network, engine and output path of a calibration, opened and checked before its touches.
 
     Attributes:
         config: The configuration without ``auto``.
@@ -179,8 +179,8 @@ def calibrate_object(
     if logs is None:
         named = config.with_values(object=name)
         paths = []
-        place = None if folder is None else Path(folder)
-        for path in record_touches(named, touches, peak_n, place, prompt=prompt, progress=progress):
+        touch_folder = None if folder is None else Path(folder)
+        for path in record_touches(named, touches, peak_n, touch_folder, prompt=prompt, progress=progress):
             paths.append(path)
             progress(f"touch {len(paths)} of {touches}")
     else:
@@ -261,23 +261,23 @@ def move_away(config: Config, folder: Path) -> Path | None:
     Raises:
         DataError: The logs can't be moved.
     """
-    first = touch_paths(config, 1, folder)[0]
-    stem = first.stem.removesuffix("01")
+    first_path = touch_paths(config, 1, folder)[0]
+    stem = first_path.stem.removesuffix("01")
     logs = [path for path in folder.glob("*.mcap") if re.fullmatch(rf"{re.escape(stem)}\d\d+", path.stem)]
     if not logs:
         return None
     number = 1
-    while (beside := folder.with_name(f"{folder.name}-old-{number}")).exists():
+    while (new_folder := folder.with_name(f"{folder.name}-old-{number}")).exists():
         number += 1
     try:
-        beside.mkdir()
+        new_folder.mkdir()
         for path in logs:
-            path.rename(beside / path.name)
+            path.rename(new_folder / path.name)
     except OSError as error:
         raise DataError(
-            f"can't move the touches in {folder} to {beside}: {error}; move them yourself"
+            f"can't move the touches in {folder} to {new_folder}: {error}; move them yourself"
         ) from error
-    return beside
+    return new_folder
 
 
 def default_folder(name: str) -> Path:
@@ -304,20 +304,20 @@ def fit_and_write(prepared: Prepared, paths: Sequence[Path], progress: Progress)
             "from open jaws"
         )
     with_contact = {path: one for path, one in with_reference.items() if one.has_contact}
-    recorded = join(with_contact or with_reference)  # without any contact, the fit reports the largest force
-    touches = recorded.touches
+    recording = join(with_contact or with_reference)  # without any contact, the fit reports the largest force
+    touches = recording.touches
     fit = fit_correction(touches, COVERAGE, prepared.engine.header.ood)  # bfloat16 has no score to limit
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")
-    used = [sha256_of(path) for path in with_contact or with_reference]
+    digests = [sha256_of(path) for path in with_contact or with_reference]
     profile, crushed_at_n = make_profile(
-        prepared.name, recorded, fit, ResolvedConfig(prepared.config, model), used, prepared.engine
+        prepared.name, recording, fit, ResolvedConfig(prepared.config, model), digests, prepared.engine
     )
     write_object(out, profile, pack(fit.arrays))
     report = out.with_suffix(".png")
     draw(profile, fit, touches, curve, report)
-    stiffness = stiffness_n_m(recorded.width_m, [press.force_n for press in recorded.presses])
+    stiffness = stiffness_n_m(recording.width_m, [press.force_n for press in recording.presses])
     return ObjectCalibration(
         profile=profile,
         profile_path=out,
@@ -340,7 +340,7 @@ def sha256_of(path: Path) -> str:
 
 def make_profile(
     name: str,
-    recorded: TouchRecording,
+    recording: TouchRecording,
     fit: ObjectFit,
     resolved: ResolvedConfig,
     logs: Sequence[str],
@@ -350,7 +350,7 @@ def make_profile(
 
     Args:
         name: Name of the object.
-        recorded: The touches that it was fitted to.
+        recording: The touches that it was fitted to.
         fit: The fit.
         resolved: Configuration, and the network.
         logs: SHA-256 of each log of the touches.
@@ -360,11 +360,11 @@ def make_profile(
         The profile, and the largest force of the touch after which the object stayed narrower, or None.
     """
     assert resolved.model is not None
-    touches = recorded.touches
-    forces_n = [press.force_n for press in recorded.presses]
-    stiffness = stiffness_n_m(recorded.width_m, forces_n)
+    touches = recording.touches
+    forces_n = [press.force_n for press in recording.presses]
+    stiffness = stiffness_n_m(recording.width_m, forces_n)
     peaks_n = np.array([force_n.max() for force_n in forces_n])
-    crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
+    crushed = crushing_touch(np.array([width_m[0] for width_m in recording.width_m]), peaks_n)
     size = resolved.model.header.preprocess.size
     frame = np.random.default_rng(0).integers(60, 180, (size, size), np.uint8)
     timed = replace(
@@ -375,7 +375,7 @@ def make_profile(
         object=name,
         date=datetime.now(UTC).date(),
         checkpoint=resolved.model.digest,
-        camera=recorded.camera,
+        camera=recording.camera,
         touches=len(touches.numbers),
         frames=len(touches.touch),
         force_n=float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max()),
@@ -383,7 +383,7 @@ def make_profile(
         interval=fit.interval,
         ood_limits=None if fit.arrays.known is None else fit.arrays.known.limits,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + compute_ms / 1e3),
+        plant=fit_plant(recording.presses, recording.delay_s + compute_ms / 1e3),
         before_n=fit.before_n,
         after_n=fit.after_n,
         weights=sha256(pack(fit.arrays)).hexdigest(),

@@ -114,9 +114,9 @@ def calibrate_servo(
             f"calibrate servo presses a rigid gauge, but the simulated object is {config.object!r}; pass --set "
             f"object={SIM_GAUGE} --gauge-mm {SIM_GAUGE_MM:g}"
         )
-    known = rig_to_update(rig)
-    given = Nominal(
-        reference_m_per_rad(config.gripper), config.gripper.open_width_m, _scale_share(known, config, rig)
+    profile = rig_to_update(rig)
+    nominal = Nominal(
+        reference_m_per_rad(config.gripper), config.gripper.open_width_m, _scale_share(profile, config, rig)
     )
     config = resolve(config.with_values(camera={"backend": "none"}), vision=False).config
     presses: list[ServoPress] = []
@@ -126,14 +126,14 @@ def calibrate_servo(
         new_presses, new_passes = measure(config, width_m, progress)
         presses += new_presses
         passes += new_passes
-    fit = fit_servo(presses, passes, given)
+    fit = fit_servo(presses, passes, nominal)
     _check_plausible(fit, config)
-    found = _section(fit, config)
-    update_rig(rig, found)
+    calibration = _section(fit, config)
+    update_rig(rig, calibration)
     report = rig.with_name(f"{rig.stem}-servo.png")
     draw(fit, presses, report)
     return ServoResult(
-        calibration=found,
+        calibration=calibration,
         n_per_a=fit.n_per_a,
         friction_share=fit.friction_share,
         free_friction_n=fit.free_friction_n,
@@ -142,7 +142,7 @@ def calibrate_servo(
         presses=len(presses),
         passes=len(passes),
         width_shift_m=2
-        * given.pinion_radius_m
+        * nominal.pinion_radius_m
         * (fit.open_position_rad.value - config.gripper.closing_sign * config.gripper.open_position_rad),
         rig=rig,
         report=report,
@@ -151,20 +151,20 @@ def calibrate_servo(
 
 def _check_plausible(fit: ServoFit, config: Config) -> None:
     """Raises `DataError` if the torque constant is far from the expected one: the load cell may be mis-scaled."""
-    expected, found = config.gripper.nm_per_a, fit.nm_per_a.value
+    expected, measured = config.gripper.nm_per_a, fit.nm_per_a.value
     assert expected is not None
-    if not 1 / PLAUSIBLE_RATIO < found / expected < PLAUSIBLE_RATIO:
+    if not 1 / PLAUSIBLE_RATIO < measured / expected < PLAUSIBLE_RATIO:
         raise DataError(
-            f"the presses give a torque constant of {found:.3g} Nm/A, {found / expected:.2f} times the expected "
+            f"the presses give a torque constant of {measured:.3g} Nm/A, {measured / expected:.2f} times the expected "
             f"{expected:.3g}: calibrate the load cell with weights again (load_cell.n_per_raw), and check "
             "servo.model and gripper.pinion_radius_m; if the gripper is really so, set gripper.nm_per_a to "
-            f"{found:.3g} and start again"
+            f"{measured:.3g} and start again"
         )
 
 
-def _scale_share(known: RigProfile, config: Config, rig: Path) -> float:
+def _scale_share(profile: RigProfile, config: Config, rig: Path) -> float:
     """Relative half-width of the interval of the load cell's scale; 0 if the profile has none of this load cell."""
-    cell = known.load_cell
+    cell = profile.load_cell
     if cell is None or cell.sensor != config.load_cell.sensor:
         return 0.0
     if cell.n_per_raw.value != config.load_cell.n_per_raw:

@@ -165,26 +165,26 @@ def teach(
             print(result.bundle, result.mae_n, result.more_touches_help)
     """
     out = (user_folder() / name if out is None else Path(out)).absolute()
-    place = default_folder(name) if folder is None else Path(folder)
+    work_folder = default_folder(name) if folder is None else Path(folder)
     config, model = check_before_touches(config, name, out)
     if logs is None:
         named = config.with_values(object=name)
         paths = []
-        for path in record_touches(named, touches, peak_n, place, prompt=prompt, progress=progress):
+        for path in record_touches(named, touches, peak_n, work_folder, prompt=prompt, progress=progress):
             paths.append(path)
             progress(f"touch {len(paths)} of {touches}")
     else:
         paths = find_logs(logs)
-    used, without_contact, contact_starts = _sorted_by_contact(paths, model)
+    logs_in_contact, without_contact, contact_starts = _sorted_by_contact(paths, model)
     # The same touch in two folds would be both learned and left out.
-    logs_by_digest = {sha256_of(path): path for path in used}
+    logs_by_digest = {sha256_of(path): path for path in logs_in_contact}
     # A touch that is replayed would be learned where it is left out.
-    replayed = {} if not replay else {sha256_of(path): path for path in find_logs(replay)}
-    others = {digest: path for digest, path in replayed.items() if digest not in logs_by_digest}
-    in_contact = [path for path in others.values() if _starts_in_contact(path, model.header.preprocess)]
-    others = {digest: path for digest, path in others.items() if path not in in_contact}
-    work = CandidateWork(logs_by_digest, others, place / "teach", workers)
-    taught = _taught(work, config, model, name, out, progress)
+    replay_logs = {} if not replay else {sha256_of(path): path for path in find_logs(replay)}
+    other_logs = {digest: path for digest, path in replay_logs.items() if digest not in logs_by_digest}
+    in_contact = [path for path in other_logs.values() if _starts_in_contact(path, model.header.preprocess)]
+    other_logs = {digest: path for digest, path in other_logs.items() if path not in in_contact}
+    work = CandidateWork(logs_by_digest, other_logs, work_folder / "teach", workers)
+    taught = _make_bundle(work, config, model, name, out, progress)
     return replace(taught, without_contact=without_contact, contact_starts=(*contact_starts, *in_contact))
 
 
@@ -209,9 +209,9 @@ def check_before_touches(config: Config, name: str, out: Path) -> tuple[Config, 
     if out.exists() and not (out / BUNDLED).is_file():
         raise ConfigError(f"{out} exists and is not a bundle; name another folder")
     file = _object_file(config)
-    if file is not None and out.exists() and (other := _file_of(out)) not in (None, file):
+    if file is not None and out.exists() and (other_file := _file_of(out)) not in (None, file):
         raise ConfigError(
-            f"the bundle {out} is that of the object in {other}, not of {file}; rename one of the files, or name "
+            f"the bundle {out} is that of the object in {other_file}, not of {file}; rename one of the files, or name "
             "another folder with --out"
         )
     check_writable(out.with_name(f"{out.name}.yaml"))
@@ -237,64 +237,66 @@ def _object_file(config: Config) -> str | None:
     return None if config.sim.object is None else str(config.sim.object.resolve())
 
 
-def _taught(
+def _make_bundle(
     work: CandidateWork, config: Config, model: Model, name: str, out: Path, progress: Progress
 ) -> Taught:
     """Takes the best candidate, makes it of all logs, calibrates it, and writes the bundle."""
     candidates = make_candidates(config, model, len(work.logs))
-    found = compare(work.left_out(candidates, progress), len(work.logs))
+    comparison = compare(work.left_out(candidates, progress), len(work.logs))
     progress("compared the candidates", STEPS - 3 - 2 * FOLDS * len(candidates))
-    chosen = candidates[found.best]
-    checkpoint = work.learned(chosen)
-    progress(f"trained on all touches: {chosen.name}")
+    candidate = candidates[comparison.best]
+    checkpoint = work.learned(candidate)
+    progress(f"trained on all touches: {candidate.name}")
     learned = load_checkpoint(checkpoint)
     preprocess = learned.header.preprocess
     run = partial(features, learned.networks, preprocess)
-    recorded = join({path: read_log(path, preprocess, run) for path in sorted(work.logs, key=started_ns)})
-    fit = _fit(recorded.touches, found)
+    recording = join({path: read_log(path, preprocess, run) for path in sorted(work.logs, key=started_ns)})
+    fit = _fit(recording.touches, comparison)
     config = config.with_values(vision={"checkpoint": str(checkpoint)})
     resolved = ResolvedConfig(config, read_model(checkpoint))
-    profile, _ = make_profile(name, recorded, fit, resolved, work.digests)
+    profile, _ = make_profile(name, recording, fit, resolved, work.digests)
     origin = {"network": _NETWORK, "file": _object_file(config)}
     progress("calibrated")
-    error_n = found.absolute_error_n
+    error_n = comparison.absolute_error_n
     taught = Taught(
         bundle=out,
         profile=profile.model_copy(update=origin),
-        learned=chosen.name,
-        candidates_mae_n={c.name: float(e) for c, e in zip(candidates, found.error_n, strict=True)},
+        learned=candidate.name,
+        candidates_mae_n={c.name: float(e) for c, e in zip(candidates, comparison.error_n, strict=True)},
         before_n=fit.before_n,
         mae_n=float(error_n.mean()),
-        contact_mae_n=float(error_n[found.measured.force_n > CONTACT_N].mean()),
-        fewer_mae_n=float(found.fewer_n[found.best]),
-        more_touches_help=bool(found.error_n[found.best] < _HELPS * found.fewer_n[found.best]),
-        coverages=coverages(found.measured, found.within),
+        contact_mae_n=float(error_n[comparison.measured.force_n > CONTACT_N].mean()),
+        fewer_mae_n=float(comparison.fewer_n[comparison.best]),
+        more_touches_help=bool(
+            comparison.error_n[comparison.best] < _HELPS * comparison.fewer_n[comparison.best]
+        ),
+        coverages=coverages(comparison.measured, comparison.within),
         without_contact=(),
         contact_starts=(),
     )
     assert fit.arrays.known is not None
-    header = _stated(learned.header, chosen, fit.arrays.known, found.left)
-    _write_bundle(taught, checkpoint, header, fit.arrays, found)
+    header = _header_with_errors(learned.header, candidate, fit.arrays.known, comparison.left)
+    _write_bundle(taught, checkpoint, header, fit.arrays, comparison)
     progress("wrote the bundle")
     return taught
 
 
-def _fit(touches: Touches, found: Comparison) -> ObjectFit:
+def _fit(touches: Touches, comparison: Comparison) -> ObjectFit:
     """Fits the correction to all touches; its errors, interval and limits are those of touches left out."""
     # The folds' networks have not seen the touches they score, but each network has its own scale of scores.
     shares, estimates_n = left_out_shares(touches)
     limits = object_limits(
-        [one.share for one in found.left] + shares,
-        [one.raw_n for one in found.left] + estimates_n,
+        [one.share for one in comparison.left] + shares,
+        [one.raw_n for one in comparison.left] + estimates_n,
         touches=len(shares),
     )
     fit = fit_correction(touches, COVERAGE)
     return replace(
         fit,
         arrays=replace(fit.arrays, known=KnownFrames(*object_subspace(touches), limits)),
-        interval=touch_interval(found.estimate_n, *found.measured, COVERAGE),
-        before_n=float(np.abs(found.before_n - found.measured.force_n).mean()),
-        after_n=float(found.absolute_error_n.mean()),
+        interval=touch_interval(comparison.estimate_n, *comparison.measured, COVERAGE),
+        before_n=float(np.abs(comparison.before_n - comparison.measured.force_n).mean()),
+        after_n=float(comparison.absolute_error_n.mean()),
     )
 
 
@@ -302,27 +304,27 @@ def _sorted_by_contact(
     paths: Sequence[Path], model: Model
 ) -> tuple[list[Path], tuple[Path, ...], tuple[Path, ...]]:
     """Returns the logs that can be used, those without contact, and those that start in contact."""
-    used, without_contact, contact_starts = [], [], []
+    logs_in_contact, without_contact, contact_starts = [], [], []
     for path in paths:
         clips = load_clips([path], model.header.preprocess)
         if starts_in_contact(clips[0].forces_n, model.header.preprocess):
             contact_starts.append(path)
         elif any((clip.forces_n > CONTACT_N).any() for clip in clips):
-            used.append(path)
+            logs_in_contact.append(path)
         else:
             without_contact.append(path)
-    return used, tuple(without_contact), tuple(contact_starts)
+    return logs_in_contact, tuple(without_contact), tuple(contact_starts)
 
 
 def _starts_in_contact(path: Path, preprocess: Preprocess) -> bool:
     """Returns `starts_in_contact` of a log, of which only the first frames are read: a training reads all of it."""
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
-    streamed = StreamedClip(reader, config, reader.records(Frame, LoadCellSample), preprocess)
-    for _ in islice(streamed.frames(), preprocess.reference_frames + _FRAMES_AFTER):
+    stream = StreamedClip(reader, config, reader.records(Frame, LoadCellSample), preprocess)
+    for _ in islice(stream.frames(), preprocess.reference_frames + _FRAMES_AFTER):
         pass
     try:
-        clip = streamed.clip(streamed.no_images)
+        clip = stream.clip(stream.no_images)
         is_whole = bool(clip.valid[: preprocess.reference_frames].all())
     except DataError:
         is_whole = False
@@ -331,22 +333,24 @@ def _starts_in_contact(path: Path, preprocess: Preprocess) -> bool:
     return starts_in_contact(clip.forces_n, preprocess)
 
 
-def _stated(header: Header, candidate: Candidate, known: KnownFrames, left: Sequence[LeftOut]) -> Header:
+def _header_with_errors(
+    header: Header, candidate: Candidate, known_frames: KnownFrames, left_out: Sequence[LeftOut]
+) -> Header:
     """Returns a header with the errors, and the out-of-distribution score, that logs left out show."""
-    raw_n, force_n = (np.concatenate([getattr(one, key) for one in left]) for key in ("raw_n", "force_n"))
+    raw_n, force_n = (np.concatenate([getattr(one, key) for one in left_out]) for key in ("raw_n", "force_n"))
     if candidate.recipe:
-        stated = {"residuals": residuals(raw_n, force_n), "metrics": errors(raw_n, force_n), "ood": None}
-        header = header.model_copy(update=stated)
+        values = {"residuals": residuals(raw_n, force_n), "metrics": errors(raw_n, force_n), "ood": None}
+        header = header.model_copy(update=values)
     if header.ood is None:
         z = (raw_n - force_n) / claimed_std_n(header, raw_n[None])
-        scored = [one.share for one in left], [one.raw_n for one in left]
-        ood = model_of_scores(known, *scored, z, force_n > CONTACT_N)
+        scores = [one.share for one in left_out], [one.raw_n for one in left_out]
+        ood = model_of_scores(known_frames, *scores, z, force_n > CONTACT_N)
         header = header.model_copy(update={"ood": ood})
     return header
 
 
 def _write_bundle(
-    taught: Taught, checkpoint: Path, header: Header, arrays: ProfileArrays, found: Comparison
+    taught: Taught, checkpoint: Path, header: Header, arrays: ProfileArrays, comparison: Comparison
 ) -> None:
     """Writes the folder of a bundle. An earlier one is replaced once the new one is complete."""
     out = taught.bundle
@@ -361,13 +365,15 @@ def _write_bundle(
         write_object(part / BUNDLED, taught.profile, pack(arrays))
         draw(
             taught.profile,
-            found.measured.force_n,
-            found.before_n,
-            found.estimate_n,
+            comparison.measured.force_n,
+            comparison.before_n,
+            comparison.estimate_n,
             taught.coverages,
             {
-                name: ends
-                for name, *ends in zip(taught.candidates_mae_n, found.fewer_n, found.error_n, strict=True)
+                name: errors_n
+                for name, *errors_n in zip(
+                    taught.candidates_mae_n, comparison.fewer_n, comparison.error_n, strict=True
+                )
             },
             taught.learned,
             part / _FIGURE,

@@ -131,17 +131,17 @@ class CandidateWork:
             # A network is trained for each split alone; all else is quick.
             groups = [(split,) for split in splits] if candidate.recipe == "touches" else [tuple(splits)]
             tasks += [self._task(candidate, group) for group in groups]
-        missing = [task for task in tasks if not task.file.exists()]
+        open_tasks = [task for task in tasks if not task.file.exists()]
         for task in tasks:
-            if task not in missing:
+            if task not in open_tasks:
                 progress(f"{task.candidate.name}: known", len(task.splits))
         if self._workers == 1:
-            for task in missing:
+            for task in open_tasks:
                 _evaluate(task)
                 progress(task.candidate.name, len(task.splits))
         else:
             with process_pool(self._workers) as pool:
-                futures = {pool.submit(_evaluate_in_process, task): task for task in missing}
+                futures = {pool.submit(_evaluate_in_process, task): task for task in open_tasks}
                 for future in as_completed(futures):
                     future.result()
                     progress(futures[future].candidate.name, len(futures[future].splits))
@@ -237,14 +237,14 @@ def compare(results: Results, count: int) -> Comparison:
 def make_candidates(config: Config, model: Model, logs: int) -> list[Candidate]:
     """Returns the candidates for a number of logs, beginning with the configured network ``model`` as it is."""
     base = config.vision.checkpoint
-    named = base if base in SHIPPED else Path(base).name
-    found = [Candidate(f"{named} as it is", base, "")]
+    network_name = base if base in SHIPPED else Path(base).name
+    candidates = [Candidate(f"{network_name} as it is", base, "")]
     if not any(isinstance(member, GaussianProcessConfig) for member in model.header.members):
         trained = "small" if base == "default" else base
-        found.append(Candidate(f"{Path(trained).name}, trained", trained, "touches"))
+        candidates.append(Candidate(f"{Path(trained).name}, trained", trained, "touches"))
     if logs >= 2 * FOLDS:  # a process chooses its settings on logs left out, and so needs two in a fold
-        found.append(Candidate("Gaussian process", base, "few"))
-    return found
+        candidates.append(Candidate("Gaussian process", base, "few"))
+    return candidates
 
 
 def _evaluate_in_process(task: _Task) -> None:
@@ -255,31 +255,31 @@ def _evaluate_in_process(task: _Task) -> None:
 def _evaluate(task: _Task) -> None:
     """Makes the candidate for each split, calibrates it, and writes its estimates of the logs left out."""
     arrays: dict[str, npt.NDArray[Any]] = {}
-    recorded: list[TouchRecording] = []
+    recordings: list[TouchRecording] = []
     task.file.parent.mkdir(parents=True, exist_ok=True)
     for number, (split, test) in enumerate(zip(task.splits, task.tests, strict=True)):
         file = task.file.with_suffix(f".{number}.safetensors")
-        if task.candidate.recipe or not recorded:  # a network as it is sees the same in every split
-            made = _make(task, split, file)
-            run = partial(features, made.networks, made.header.preprocess)
-            recorded = [read_log(path, made.header.preprocess, run) for path in task.logs]
-        known = join({task.logs[i]: recorded[i] for i in split}).touches
-        subspace = object_subspace(known)
+        if task.candidate.recipe or not recordings:  # a network as it is sees the same in every split
+            checkpoint = _make(task, split, file)
+            run = partial(features, checkpoint.networks, checkpoint.header.preprocess)
+            recordings = [read_log(path, checkpoint.header.preprocess, run) for path in task.logs]
+        learned_touches = join({task.logs[i]: recordings[i] for i in split}).touches
+        subspace = object_subspace(learned_touches)
         try:
-            fit = fit_correction(known, COVERAGE)
+            fit = fit_correction(learned_touches, COVERAGE)
         except DataError:  # the estimates do not follow the load cell: they stay as they are
             fit = None
-        begins = np.cumsum([0, *(len(one.touches.numbers) for one in recorded)])
+        begins = np.cumsum([0, *(len(one.touches.numbers) for one in recordings)])
         for i in test:
-            touches = recorded[i].touches
-            left = LeftOut(
+            touches = recordings[i].touches
+            result = LeftOut(
                 touches.estimate_n,
                 touches.estimate_n if fit is None else fit.predict(touches),
                 touches.force_n,
                 residual_share(touches.features, *subspace),
                 touches.touch + begins[i],
             )
-            arrays |= {f"{number} {i} {key}": value for key, value in left._asdict().items()}
+            arrays |= {f"{number} {i} {key}": value for key, value in result._asdict().items()}
         file.unlink(missing_ok=True)
     write_all({task.file: save(arrays)})
 
@@ -315,7 +315,7 @@ def _make(task: _Task, split: Sequence[int], file: Path) -> Checkpoint:
     )
 
 
-def _clips(logs: Sequence[Path], size: int, chosen: Sequence[int]) -> list[Clip]:
+def _clips(logs: Sequence[Path], size: int, indices: Sequence[int]) -> list[Clip]:
     """Returns clips of the chosen logs, each a set of its own."""
-    clips = load_clips([logs[i] for i in chosen], Preprocess(size=size))
+    clips = load_clips([logs[i] for i in indices], Preprocess(size=size))
     return [replace(clip, set=f"{i} {clip.name}") for i, clip in enumerate(clips)]

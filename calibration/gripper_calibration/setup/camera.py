@@ -83,9 +83,9 @@ def camera(task: Task) -> StepResult:
 
 
 def _region(task: Task, markers: Markers, gray: Gray) -> Region | None:
-    given: Region | None = task.given.get("vision.region")
-    if given is not None:
-        return given
+    region: Region | None = task.given.get("vision.region")
+    if region is not None:
+        return region
     height, width = gray.shape
     try:
         return region_around([markers], width, height)
@@ -118,17 +118,17 @@ def _light(gray: Gray, best: ExposureCandidate) -> list[str]:
 
 
 def _focus(gray: Gray, region: Region | None) -> list[str]:
-    found = blur(_part(gray, region))
-    if found > MAX_BLUR:
+    blur_share = blur(_part(gray, region))
+    if blur_share > MAX_BLUR:
         return [
-            f"focus: blurred ({found:.2f}; above {MAX_BLUR:g}); turn the lens, or set camera.lens_position, until "
+            f"focus: blurred ({blur_share:.2f}; above {MAX_BLUR:g}); turn the lens, or set camera.lens_position, until "
             "edges of object and jaws are sharp"
         ]
-    return [f"focus: sharp ({found:.2f}; blurred above {MAX_BLUR:g})"]
+    return [f"focus: sharp ({blur_share:.2f}; blurred above {MAX_BLUR:g})"]
 
 
 def _markers(markers: Markers, region: Region | None, gray: Gray) -> list[str]:
-    seen = " and ".join(str(number) for number in sorted(markers))
+    names = " and ".join(str(number) for number in sorted(markers))
     if len(markers) == len(MARKERS):
         remarks = ["markers: both seen"]
         if region is None:
@@ -138,29 +138,29 @@ def _markers(markers: Markers, region: Region | None, gray: Gray) -> list[str]:
             ]
     elif markers:
         remarks = [
-            f"markers: only {seen} is seen; bring both into view, lit and not hidden, for a region around them"
+            f"markers: only {names} is seen; bring both into view, lit and not hidden, for a region around them"
         ]
     else:
         remarks = ["markers: none (DICT_4X4_50, ids 0 and 1); they are optional"]
     if region is None:
         return [*remarks, "region: the whole frame; set vision.region to the part that shows the jaws"]
     share = region[2] / min(gray.shape)
-    small = "; bring the camera nearer, so that the jaws fill it" if share < _MIN_REGION_SHARE else ""
-    return [*remarks, f"region: {100 * share:.0f} % of the frame's side{small}"]
+    advice = "; bring the camera nearer, so that the jaws fill it" if share < _MIN_REGION_SHARE else ""
+    return [*remarks, f"region: {100 * share:.0f} % of the frame's side{advice}"]
 
 
 def _save(gray: Gray, markers: Markers, region: Region | None, path: Path) -> None:
     """Saves the enlarged picture with its region and markers drawn."""
     factor = max(1, _SHOWN_PX // max(gray.shape))
-    shown = cv2.cvtColor(
+    picture = cv2.cvtColor(
         cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST), cv2.COLOR_GRAY2BGR
     )
     for corners in markers.values():
         outline = np.rint((corners + 0.5) * factor).astype(np.int32)
-        cv2.polylines(shown, [outline], True, _COLOURS["marker"], 2)
+        cv2.polylines(picture, [outline], True, _COLOURS["marker"], 2)
     if region is not None:
         left, top, width, height = (factor * one for one in region)
-        cv2.rectangle(shown, (left, top), (left + width - 1, top + height - 1), _COLOURS["region"], 2)
+        cv2.rectangle(picture, (left, top), (left + width - 1, top + height - 1), _COLOURS["region"], 2)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), shown):
+    if not cv2.imwrite(str(path), picture):
         raise DataError(f"can't write the picture {path}; check its folder")

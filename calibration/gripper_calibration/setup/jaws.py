@@ -40,29 +40,29 @@ def jaws(task: Task) -> StepResult:
         if config.sim.open_width_m is None:  # what is found must not change the simulated gripper
             true_m = config.gripper.open_width_m
             values["sim.open_width_m"] = Found(true_m, "true width of the simulated jaws")
-    found = calibrate_jaws(homed, prompt=task.person.do, progress=task.progress)
+    result = calibrate_jaws(homed, prompt=task.person.do, progress=task.progress)
     today = date.today().isoformat()
-    origin = f"homed {today}, ends repeated within {found.repeat_rad:.3f} rad"
+    origin = f"homed {today}, ends repeated within {result.repeat_rad:.3f} rad"
     values |= {
-        "gripper.closing_sign": Found(found.closing_sign, f"homed {today}"),
-        "gripper.open_position_rad": Found(round(found.open_position_rad, 4), origin),
+        "gripper.closing_sign": Found(result.closing_sign, f"homed {today}"),
+        "gripper.open_position_rad": Found(round(result.open_position_rad, 4), origin),
         "gripper.open_width_m": Found(
-            round(found.open_width_m, 4),
+            round(result.open_width_m, 4),
             f"travel between the ends, homed {today}"
             if config.gripper.linkage.kind == "rack"
             else "of the linkage",
         ),
         "gripper.friction_n": Found(
-            round(found.friction_n, 2),
-            f"{found.running_n[0]:.2f} N closing, {found.running_n[1]:.2f} N opening, homed {today}",
+            round(result.friction_n, 2),
+            f"{result.running_n[0]:.2f} N closing, {result.running_n[1]:.2f} N opening, homed {today}",
         ),
     }
     found_keys = (key.partition(".") for key in values)
     gripper = {key: values[f"gripper.{key}"].value for part, _, key in found_keys if part == "gripper"}
     resolve(config.with_values(gripper=gripper), vision=False)  # the travel must lie within the servo's turn
     return StepResult(
-        f"the jaws open to {1e3 * found.open_width_m:.1f} mm, close with "
-        f"{'rising' if found.closing_sign > 0 else 'falling'} angle, friction {found.friction_n:.2f} N",
+        f"the jaws open to {1e3 * result.open_width_m:.1f} mm, close with "
+        f"{'rising' if result.closing_sign > 0 else 'falling'} angle, friction {result.friction_n:.2f} N",
         values,
-        details={"jaws": found},
+        details={"jaws": result},
     )

@@ -42,15 +42,15 @@ def load_cell(task: Task) -> StepResult:
     mass_kg = task.mass_kg
     if mass_kg is None:
         mass_kg = 1e-3 * task.number("Known mass in grams", "--mass-kg KG")
-    found = calibrate_load_cell(
+    result = calibrate_load_cell(
         task.config,
         mass_kg * STANDARD_GRAVITY_M_S2,
         task.folder / PROFILE,
         prompt=task.person.do,
         progress=task.progress,
     )
-    cell = found.calibration
-    by = f"weighed with {1e3 * mass_kg:g} g, {cell.date.date().isoformat()}"
+    cell = result.calibration
+    origin = f"weighed with {1e3 * mass_kg:g} g, {cell.date.date().isoformat()}"
     config = task.config.with_values(
         load_cell={"tare_raw": cell.tare_raw.value, "n_per_raw": cell.n_per_raw.value}
     )
@@ -58,11 +58,11 @@ def load_cell(task: Task) -> StepResult:
     return StepResult(
         f"calibrated with {1e3 * mass_kg:g} g; noise {cell.noise_n:.3f} N",
         {
-            "load_cell.tare_raw": Found(cell.tare_raw.value, by),
-            "load_cell.n_per_raw": Found(cell.n_per_raw.value, f"{interval(cell.n_per_raw)}, {by}"),
+            "load_cell.tare_raw": Found(cell.tare_raw.value, origin),
+            "load_cell.n_per_raw": Found(cell.n_per_raw.value, f"{interval(cell.n_per_raw)}, {origin}"),
         },
         remarks,
-        {"figure": found.report},
+        {"figure": result.report},
         {"load_cell": cell},
         {"mass_kg": mass_kg},
     )

@@ -47,15 +47,15 @@ class RigFile:
         rig._keep_original = bool(tree) and not rig._state.exists()
         for key, value in flat(tree).items():
             rig.given[key] = Found(value, "given in this file")
-        for key, was in rig._read_state().items():
-            if key in rig.given and rig.given[key].value == was.value:
+        for key, old in rig._read_state().items():
+            if key in rig.given and rig.given[key].value == old.value:
                 del rig.given[key]
                 if not fresh:
-                    rig.found[key] = was
-        passed: Tree = {}
+                    rig.found[key] = old
+        overridden: Tree = {}
         for assignment in overrides or []:
-            assign(passed, assignment)
-        for key, value in flat(passed).items():
+            assign(overridden, assignment)
+        for key, value in flat(overridden).items():
             rig.found.pop(key, None)
             rig.given[key] = Found(value, "given with --set")
         if fresh:
@@ -109,34 +109,34 @@ class RigFile:
     def forget(self, name: str) -> None:
         """Drops what a step found when it ran before, but not a person's answers.
 
-        What an earlier step found of the same key is back.
+        The value that an earlier step found for the same key applies again.
         """
         for key, value in self.steps.get(name, {}).get("values", {}).items():
             if key in self.found and self.found[key].value == value[0] and value[1] != ANSWERED:
-                before = [
+                earlier_values = [
                     s["values"][key]
                     for n, s in self.steps.items()
                     if n != name and key in s.get("values", {})
                 ]
-                if before:
-                    self.found[key] = Found(*before[-1])
+                if earlier_values:
+                    self.found[key] = Found(*earlier_values[-1])
                 else:
                     del self.found[key]
 
     def outdate(self, name: str) -> list[str]:
         """Marks the later steps that refine what a step has found anew: they run again. Returns their names."""
         order = list(self.steps)
-        own = self.steps[name]["values"]
-        later = [
-            one
-            for one in order[order.index(name) + 1 :]
-            if own.keys() & self.steps[one].get("values", {}).keys()
+        new_values = self.steps[name]["values"]
+        outdated = [
+            step
+            for step in order[order.index(name) + 1 :]
+            if new_values.keys() & self.steps[step].get("values", {}).keys()
         ]
-        for one in later:
-            self.steps[one]["outdated_by"] = name
-        if later:
+        for step in outdated:
+            self.steps[step]["outdated_by"] = name
+        if outdated:
             self.write()
-        return later
+        return outdated
 
     def keep(self, values: Mapping[str, Found]) -> None:
         """Takes values at once, because a device has them already, and writes the rig file."""
@@ -148,7 +148,7 @@ class RigFile:
 
         Args:
             name: Its name.
-            step: What is to be kept of it.
+            step: Its entry in the state.
             order: Names of all steps, in the order in which they refine each other's values.
 
         Raises:
@@ -207,25 +207,25 @@ class RigFile:
         return head + "".join(f"{line}\n" for line in _lines(self.tree(), origins, list(Config.model_fields)))
 
 
-def flat(tree: Tree, under: str = "") -> dict[str, Any]:
+def flat(tree: Tree, prefix: str = "") -> dict[str, Any]:
     """Returns the leaves of a tree by key path; an empty section is a leaf."""
     leaves: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, dict) and value:
-            leaves |= flat(value, f"{under}{name}.")
+            leaves |= flat(value, f"{prefix}{name}.")
         else:
-            leaves[f"{under}{name}"] = value
+            leaves[f"{prefix}{name}"] = value
     return leaves
 
 
-def _lines(tree: Tree, origins: Mapping[str, str], order: list[str], under: str = "") -> list[str]:
+def _lines(tree: Tree, origins: Mapping[str, str], order: list[str], prefix: str = "") -> list[str]:
     lines = []
-    indent = "  " * under.count(".")
+    indent = "  " * prefix.count(".")
     for name in sorted(tree, key=lambda one: order.index(one) if one in order else len(order)):
         value = tree[name]
         if isinstance(value, dict) and value:
-            lines += [f"{indent}{name}:", *_lines(value, origins, [], f"{under}{name}.")]
+            lines += [f"{indent}{name}:", *_lines(value, origins, [], f"{prefix}{name}.")]
             continue
         text = to_yaml(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
-        lines.append(f"{f'{indent}{name}: {text}':{_COMMENT_COLUMN}}  # {origins[f'{under}{name}']}")
+        lines.append(f"{f'{indent}{name}: {text}':{_COMMENT_COLUMN}}  # {origins[f'{prefix}{name}']}")
     return lines

@@ -28,14 +28,14 @@ class Step:
         title: What it does, for a person.
         run: Its function.
         rests_on: Sections and keys of the configuration; if one changes, the step runs again.
-        but: Keys among them that the step sets itself.
+        set_keys: Keys among them that the step sets itself.
         uses: Returns which of mass and width the step uses with a configuration; another one makes it run again.
     """
 
     title: str
     run: Callable[[Task], StepResult]
     rests_on: tuple[str, ...] = ()
-    but: tuple[str, ...] = ()
+    set_keys: tuple[str, ...] = ()
     uses: Callable[[Config], tuple[str, ...]] = lambda config: ()
 
 
@@ -247,15 +247,16 @@ class Setup:
         return {
             key: value
             for key, value in leaves.items()
-            if key not in step.but and any(key == one or key.startswith(f"{one}.") for one in step.rests_on)
+            if key not in step.set_keys
+            and any(key == one or key.startswith(f"{one}.") for one in step.rests_on)
         }
 
     def _changed(self, name: str, step: Step) -> list[str]:
         """Keys whose values differ from those that a finished step rested on."""
         if outdated_by := self.rig.steps[name].get("outdated_by"):
             return [f"what {outdated_by} found"]
-        before, now = self.rig.steps[name].get("rests_on", {}), self._inputs(step)
-        return [key for key in now if now[key] != before.get(key)]
+        old, new = self.rig.steps[name].get("rests_on", {}), self._inputs(step)
+        return [key for key in new if new[key] != old.get(key)]
 
     def _changed_options(self, name: str, step: Step) -> list[str]:
         """Mass or width, if another one is given than the one that a finished step used."""

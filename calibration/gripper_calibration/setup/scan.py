@@ -45,17 +45,19 @@ def scan(task: Task) -> StepResult:
     assert servo.max_current_a is not None
     if "servo.current_limit_a" not in task.given and task.config.servo.current_limit_a > servo.max_current_a:
         values["servo.current_limit_a"] = servo.max_current_a
-    own = {servo.id, task.config.servo.second.id}
-    others = [one.id for one in servos if one.port == servo.port and one.id not in own]
-    if others:
-        remarks.append(f"other servos on this bus stay untouched: id {', '.join(map(str, sorted(others)))}")
-    if (wanted := task.given.get("servo.model")) not in (None, servo.model):
-        remarks.append(f"servo.model was {wanted}, but the servo is {servo.model}")
+    own_ids = {servo.id, task.config.servo.second.id}
+    other_ids = [one.id for one in servos if one.port == servo.port and one.id not in own_ids]
+    if other_ids:
+        remarks.append(
+            f"other servos on this bus stay untouched: id {', '.join(map(str, sorted(other_ids)))}"
+        )
+    if (given_model := task.given.get("servo.model")) not in (None, servo.model):
+        remarks.append(f"servo.model was {given_model}, but the servo is {servo.model}")
     sensors = {} if _is_virtual(servo.port) else _real_sensors(task, ports, servo.port, remarks)
-    found = {key: Found(value, ORIGIN) for key, value in {**values, **sensors}.items()}
+    result = {key: Found(value, ORIGIN) for key, value in {**values, **sensors}.items()}
     return StepResult(
         f"{servo.model} with id {servo.id} on {servo.port} at {servo.baud_rate} baud",
-        found,
+        result,
         remarks,
         details={"servos": [asdict(one) for one in servos]},
     )
@@ -75,72 +77,72 @@ def _line(servo: FoundServo) -> str:
 
 def _scan_ports(task: Task) -> tuple[list[str], list[PortScan]]:
     """Returns all real ports, and what answers: on the given port, or else on all of them."""
-    given, ports = task.given.get("servo.port"), doctor.serial_ports()
-    if given is not None and not _is_virtual(given) and not Path(given).exists():
+    given_port, ports = task.given.get("servo.port"), doctor.serial_ports()
+    if given_port is not None and not _is_virtual(given_port) and not Path(given_port).exists():
         raise DeviceNotFoundError(
-            f"there is no port {given}; there are {', '.join(ports) or 'none'}: name one with --set servo.port=PATH, "
-            "or leave servo.port out to search all of them"
+            f"there is no port {given_port}; there are {', '.join(ports) or 'none'}: name one with --set "
+            "servo.port=PATH, or leave servo.port out to search all of them"
         )
-    first = [] if given is None else [given]
-    scans = doctor.scan_servos(task.config, first, task.progress)
-    if not any(one.servos for one in scans) and not (given and _is_virtual(given)):
-        searched = {str(Path(one).resolve()) for one in first}
-        rest = [port for port in ports if str(Path(port).resolve()) not in searched]
-        scans += doctor.scan_servos(task.config, rest, task.progress)
+    given_ports = [] if given_port is None else [given_port]
+    scans = doctor.scan_servos(task.config, given_ports, task.progress)
+    if not any(one.servos for one in scans) and not (given_port and _is_virtual(given_port)):
+        searched = {str(Path(one).resolve()) for one in given_ports}
+        other_ports = [port for port in ports if str(Path(port).resolve()) not in searched]
+        scans += doctor.scan_servos(task.config, other_ports, task.progress)
     return ports, scans
 
 
 def _gripper(task: Task, servos: list[FoundServo], scans: list[PortScan]) -> FoundServo:
-    usable = [servo for servo in servos if servo.max_current_a is not None]
-    if not usable:
+    usable_servos = [servo for servo in servos if servo.max_current_a is not None]
+    if not usable_servos:
         for text in _CHECK:
             task.person.tell(f"- {text}")
-        where = ", ".join(one.port for one in scans) or "any port: no serial port is plugged in"
-        found = f"; {', '.join(map(_line, servos))}" if servos else ""
+        port_names = ", ".join(one.port for one in scans) or "any port: no serial port is plugged in"
+        found_text = f"; {', '.join(map(_line, servos))}" if servos else ""
         raise DeviceNotFoundError(
-            f"no servo with current control answers on {where}, at any baud rate{found}; check supply, cable and "
-            "permission, name the port with --set servo.port=PATH, or try without hardware: "
+            f"no servo with current control answers on {port_names}, at any baud rate{found_text}; check supply, "
+            "cable and permission, name the port with --set servo.port=PATH, or try without hardware: "
             "--set servo.port=virtual:rig"
         )
-    named = {key: task.given[key] for key in ("servo.port", "servo.id") if key in task.given}
-    fitting = [servo for servo in usable if _is_named(servo, named)]
-    usable = fitting or usable
-    if fitting and len(usable) == 1:
-        return usable[0]
+    given_keys = {key: task.given[key] for key in ("servo.port", "servo.id") if key in task.given}
+    fitting = [servo for servo in usable_servos if _is_named(servo, given_keys)]
+    usable_servos = fitting or usable_servos
+    if fitting and len(usable_servos) == 1:
+        return usable_servos[0]
     if not fitting:  # the gripper may be without power, and these servos an arm's: never take one silently
         task.person.tell(
-            f"no servo answers with {', '.join(f'{key}={value}' for key, value in named.items())}"
+            f"no servo answers with {', '.join(f'{key}={value}' for key, value in given_keys.items())}"
         )
-    answers = {f"{servo.id} on {servo.port}": servo for servo in usable}
-    if len({servo.port for servo in usable}) == 1:
-        answers = {str(servo.id): servo for servo in usable}
+    answers = {f"{servo.id} on {servo.port}": servo for servo in usable_servos}
+    if len({servo.port for servo in usable_servos}) == 1:
+        answers = {str(servo.id): servo for servo in usable_servos}
     option = "--set servo.id=ID and, with several ports, --set servo.port=PATH"
     return answers[task.person.choose("Which id is the gripper's servo?", list(answers), option)]
 
 
-def _is_named(servo: FoundServo, named: Mapping[str, Any]) -> bool:
+def _is_named(servo: FoundServo, given_keys: Mapping[str, Any]) -> bool:
     """Returns True if a servo has the port and the id that are given."""
-    port = named.get("servo.port", servo.port)
+    port = given_keys.get("servo.port", servo.port)
     same_port = port == servo.port or Path(port).resolve() == Path(servo.port).resolve()
-    return same_port and named.get("servo.id", servo.id) == servo.id
+    return same_port and given_keys.get("servo.id", servo.id) == servo.id
 
 
 def _real_sensors(task: Task, ports: list[str], servo_port: str, remarks: list[str]) -> dict[str, Any]:
     """Keys of camera, load cell and clock of a real rig. What is given is kept."""
-    found: Tree = {} if "clock" in task.given else {"clock": "realtime"}
+    settings: Tree = {} if "clock" in task.given else {"clock": "realtime"}
     if "camera.backend" not in task.given:
-        found |= _section("camera", _camera(task, remarks))
+        settings |= _section("camera", _camera(task, remarks))
     if "load_cell.backend" not in task.given:
-        used = str(Path(servo_port).resolve())
-        free = [port for port in ports if str(Path(port).resolve()) != used]
+        used_port = str(Path(servo_port).resolve())
+        free = [port for port in ports if str(Path(port).resolve()) != used_port]
         cell = doctor.find_load_cell(task.config, free, task.progress)
         if cell is None:
             remarks.append(
                 "no serial load cell was found; once it is connected, `setup --step scan` looks again (a Phidget "
                 "bridge is not searched for: --set load_cell.backend=phidget)"
             )
-        found |= _section("load_cell", cell or {"backend": "none"})
-    return found
+        settings |= _section("load_cell", cell or {"backend": "none"})
+    return settings
 
 
 def _camera(task: Task, remarks: list[str]) -> Tree:

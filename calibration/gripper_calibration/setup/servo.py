@@ -40,7 +40,7 @@ def servo(task: Task) -> StepResult:
 
 def _set_up(task: Task, id_: int) -> tuple[list[RegisterChange], dict[str, Found]]:
     """Returns the changes that were written, and the keys that follow from those that were not."""
-    alone = task.config.with_values(servo={"id": id_, "second": type(task.config.servo.second)()})
+    servo_config = task.config.with_values(servo={"id": id_, "second": type(task.config.servo.second)()})
     written: list[RegisterChange] = []
     declined: list[RegisterChange] = []
 
@@ -51,7 +51,7 @@ def _set_up(task: Task, id_: int) -> tuple[list[RegisterChange], dict[str, Found
         (written if agreed else declined).append(change)
         return agreed
 
-    doctor.setup(alone, asked, commission=True)
+    doctor.setup(servo_config, asked, commission=True)
     values: dict[str, Found] = {}
     if any(one.register == "baud_rate" for one in written):
         values["servo.baud_rate"] = Found(_FAST, "written to the servo")

@@ -48,10 +48,10 @@ def torque(task: Task) -> StepResult:
         default = SIM_GAUGE_MM if simulated else None
         gauge_mm = task.number("Width of the load cell between the jaws in mm", "--gauge-mm MM", default)
     pressed = config.with_values(object=SIM_GAUGE) if simulated else config
-    found = calibrate_servo(
+    result = calibrate_servo(
         pressed, [1e-3 * gauge_mm], task.folder / PROFILE, prompt=task.person.do, progress=task.progress
     )
-    servo = found.calibration
+    servo = result.calibration
     by = f"pressed the load cell, {servo.date.date().isoformat()}"
     settings = RigProfile(servo=servo).settings()["gripper"]
     origins = {
@@ -65,13 +65,13 @@ def torque(task: Task) -> StepResult:
     values = {
         f"gripper.{key}": Found(round(settings[key], 5), f"{origin}, {by}") for key, origin in origins.items()
     }
-    after = config.with_values(gripper={key: settings[key] for key in origins})
+    calibrated_config = config.with_values(gripper={key: settings[key] for key in origins})
     return StepResult(
         f"{servo.nm_per_a.value:.3f} Nm/A ({interval(servo.nm_per_a)})",
         values,
-        [*([] if found.width_remark is None else [found.width_remark]), _reference(after)],
-        {"figure": found.report},
-        {"servo": servo, "intervals_n": _intervals_n(after)},
+        [*([] if result.width_remark is None else [result.width_remark]), _reference(calibrated_config)],
+        {"figure": result.report},
+        {"servo": servo, "intervals_n": _intervals_n(calibrated_config)},
         {"gauge_mm": gauge_mm},
     )
 
@@ -91,24 +91,24 @@ def _weight(task: Task) -> StepResult:
         )
     if mass_kg == 0:
         return _data_sheet(task)
-    found = calibrate_weight(task.config, mass_kg, prompt=task.person.do, progress=task.progress)
-    by = f"balanced {1e3 * mass_kg:g} g, {date.today().isoformat()}"
-    settings = found.settings
+    result = calibrate_weight(task.config, mass_kg, prompt=task.person.do, progress=task.progress)
+    origin = f"balanced {1e3 * mass_kg:g} g, {date.today().isoformat()}"
+    settings = result.settings
     if "friction_n" in settings:
         settings["friction_std"] = FRICTION_DRIFT  # the jaws step has measured it
     origins = {
-        "nm_per_a": f"{interval(found.nm_per_a)}, {by}",
-        "gain_std": f"relative error of nm_per_a, {by}",
-        "friction_n": f"that of the homing, scaled like nm_per_a, {by}",
+        "nm_per_a": f"{interval(result.nm_per_a)}, {origin}",
+        "gain_std": f"relative error of nm_per_a, {origin}",
+        "friction_n": f"that of the homing, scaled like nm_per_a, {origin}",
         "friction_std": "relative error of friction_n",
     }
     values = {f"gripper.{key}": Found(round(value, 5), origins[key]) for key, value in settings.items()}
-    after = task.config.with_values(gripper=settings)
+    calibrated_config = task.config.with_values(gripper=settings)
     return StepResult(
-        f"{found.nm_per_a.value:.3f} Nm/A ({interval(found.nm_per_a)})",
+        f"{result.nm_per_a.value:.3f} Nm/A ({interval(result.nm_per_a)})",
         values,
-        [_reference(after)],
-        details={"weight": found, "intervals_n": _intervals_n(after)},
+        [_reference(calibrated_config)],
+        details={"weight": result, "intervals_n": _intervals_n(calibrated_config)},
         used={"mass_kg": mass_kg},
     )
 
