@@ -47,7 +47,7 @@ class GripperForce(Robot):
     def __init__(self, config: GripperForceConfig) -> None:
         self._gripper: gf.Gripper | None = None
         self._resources = ExitStack()
-        self._sent: float | None = None
+        self._last_value: float | None = None
         super().__init__(config)
         self.config = config
         # LeRobot's users expect no torque after `disconnect`.
@@ -105,7 +105,7 @@ class GripperForce(Robot):
                 camera.connect()
                 stack.callback(camera.disconnect)
             gripper = stack.enter_context(gf.open_gripper(self.settings, log=self.config.log))
-            self._sent = None
+            self._last_value = None
             self._resources = stack.pop_all()
         self._gripper = gripper
         self.configure()
@@ -163,33 +163,33 @@ class GripperForce(Robot):
                 f"the action has no {key}, but {', '.join(action) or 'nothing'}; set --robot.action and "
                 "--teleop.action to the same kind"
             )
-        wanted = float(action[key])
-        if not math.isfinite(wanted):
-            raise gf.RequestError(f"the action {key}={wanted} is not finite; send a finite number")
+        value = float(action[key])
+        if not math.isfinite(value):
+            raise gf.RequestError(f"the action {key}={value} is not finite; send a finite number")
         state = gripper.state
         if state.phase == gf.Phase.FAULT:
-            self._sent = None  # after a release, the same action has to be sent again
+            self._last_value = None  # after a release, the same action has to be sent again
             raise gf.RequestError(
                 f"the action was refused: the gripper was stopped or is at fault ({state.reason}); call "
                 "robot.gripper.release() once the cause is gone"
             )
         open_width_m = gripper.config.gripper.open_width_m
         if key == ACTION_KEYS["width"]:
-            sent = min(max(wanted, 0.0), open_width_m)
+            limited = min(max(value, 0.0), open_width_m)
         else:
-            sent = 0.0 if wanted < self.config.open_below_n else min(wanted, gripper.largest_force_n)
-        if sent != self._sent:
+            limited = 0.0 if value < self.config.open_below_n else min(value, gripper.largest_force_n)
+        if limited != self._last_value:
             # A move, not a release: a release would also reset a stop that came just now.
             if key == ACTION_KEYS["width"]:
-                gripper.move(sent, wait=False)
-            elif sent == 0.0:
+                gripper.move(limited, wait=False)
+            elif limited == 0.0:
                 gripper.move(open_width_m, wait=False)
             else:
                 # An arm has moved the camera since the jaws opened, and the object may be another.
                 is_open = state.phase == gf.Phase.OPEN or state.outcome == gf.Outcome.MOVED
-                gripper.grasp(sent, wait=False, new_object=is_open)
-            self._sent = sent
-        return {key: sent}
+                gripper.grasp(limited, wait=False, new_object=is_open)
+            self._last_value = limited
+        return {key: limited}
 
     @check_if_not_connected
     def disconnect(self) -> None:
