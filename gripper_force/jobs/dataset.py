@@ -100,10 +100,10 @@ class Clip:
         if not self.renewals:
             return [self]
         lead = preprocess.reference_frames if preprocess.reference else 0
-        found = []
+        parts = []
         for begin, end in pairwise((0, *self.renewals, len(self.frames))):
             at = slice(max(begin - lead, 0), end)
-            found.append(
+            parts.append(
                 replace(
                     self,
                     frames=self.frames[at],
@@ -113,7 +113,7 @@ class Clip:
                     renewals=(),
                 )
             )
-        return found
+        return parts
 
     @property
     def nominal_n(self) -> npt.NDArray[np.float32]:
