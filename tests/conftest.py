@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.testing
-from hypothesis import settings
+from hypothesis import given, settings, strategies
 
 from gripper_force.config import dump_config, load_config
 from gripper_force.interfaces import Clock
@@ -44,8 +44,14 @@ settings.register_profile("unhurried", deadline=None, derandomize=True)
 settings.load_profile("unhurried")
 
 
+@given(strategies.none())
+def _first_example(_: None) -> None:
+    """Has no effect."""
+
+
 def pytest_collection_finish() -> None:
     """Keeps the tests themselves, hundreds of thousands of objects, out of every later garbage collection."""
+    _first_example()  # Hypothesis registers a generator, and warns where it does not find what refers to it
     gc.collect()
     gc.freeze()
 

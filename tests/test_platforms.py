@@ -109,7 +109,7 @@ def test_doctor_has_a_row_for_everything(monkeypatch: pytest.MonkeyPatch, tiny_c
 
 
 RENDER = """
-import os, sys
+import ctypes.util, os, sys
 sys.platform = "darwin"
 from gripper_hw.sim.engine import mujoco, new_renderer
 assert os.environ["MUJOCO_GL"] == "cgl"
