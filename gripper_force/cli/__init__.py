@@ -15,6 +15,7 @@ import os
 import signal
 import sys
 import warnings
+from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -73,6 +74,7 @@ _INTERRUPTED = 130
 
 def main() -> NoReturn:
     """Runs a command, and turns every foreseen failure into a one-line message and an exit code."""
+    _open_standard_streams()
     try:
         process.own_process()
         warnings.showwarning = _show_warning
@@ -94,6 +96,10 @@ def main() -> NoReturn:
         no_folder = isinstance(error, FileExistsError | NotADirectoryError)
         reason = "a file is where a folder must be" if no_folder else error.strerror
         _fail(f"can't use {error.filename}: {reason}; check the path, and who may read and write there")
+    except (
+        UnicodeEncodeError
+    ) as error:  # of a path that a file names; one of the command line can be passed on
+        _fail(f"can't use {error.object!r}: {error.encoding} lacks some of its letters; set LC_ALL=C.UTF-8")
     except BaseException as end:
         if isinstance(end, SystemExit):
             interrupted = end.code == _INTERRUPTED  # typer's code after an interrupt
@@ -113,19 +119,34 @@ def main() -> NoReturn:
     sys.exit(0)
 
 
+def _open_standard_streams() -> None:
+    """Opens the standard streams that are closed: otherwise a log could get the number of one, and its text."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            number = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(number, True)
+            setattr(sys, name, os.fdopen(number, mode))
+
+
 def _fail_without_file(error: OSError) -> NoReturn:
     """Ends the command after an error that names no file; one of another kind than those of an output is raised."""
     if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         raise error
-    sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115  # Python would write the rest at its end, and fail again
+    for name in ("stdout", "stderr"):
+        try:
+            getattr(sys, name).flush()
+        except OSError:  # Python would write the rest at its end, and fail again
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
     if error.errno == errno.EPIPE:  # of `gripper-force ... | head`
         sys.exit(1)
     _fail(f"can't write the output: {error.strerror}; make space, or send it elsewhere")
 
 
 def _fail(message: str) -> NoReturn:
-    console.err.print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
-    _print_json_error(message)
+    with suppress(OSError):
+        console.err.print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
+    with suppress(OSError):
+        _print_json_error(message)
     # An interrupt can appear as an error of what it met, such as an import.
     sys.exit(process.interrupt_exit_code() if process.is_interrupted() else 2)
 

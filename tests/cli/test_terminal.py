@@ -1,9 +1,11 @@
 """Terminal behaviour: escape codes only on a terminal that wants them, progress that a log file can hold, exit codes."""
 
 import fcntl
+import json
 import os
 import re
 import select
+import shlex
 import signal
 import subprocess
 import sys
@@ -130,6 +132,41 @@ def test_an_output_on_a_full_disk_is_one_sentence(arguments: str, tmp_path: Path
         )
     sentence = "error: can't write the output: No space left on device; make space, or send it elsewhere\n"
     assert (done.returncode, done.stderr) == (2, sentence)
+
+
+def test_messages_on_a_full_disk_do_not_hide_the_result(tmp_path: Path) -> None:
+    command = [*COMMAND, "grasp", "--set", "no_such_key=1", "--json"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=full, text=True)
+    assert done.returncode == 2
+    assert list(json.loads(done.stdout)) == ["error"]
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_standard_streams_are_no_error(closed: str, tmp_path: Path) -> None:
+    shown = 'from pathlib import Path; Path("found").write_text(str(os.open("log", os.O_CREAT)))'
+    program = f"import os; from gripper_force import cli; cli._open_standard_streams(); {shown}"
+    for words in ([*COMMAND, "config", "show"], [sys.executable, "-c", program]):
+        done = subprocess.run(
+            f"{shlex.join(words)} {closed}", shell=True, cwd=tmp_path, capture_output=True, text=True
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+    assert int((tmp_path / "found").read_text()) > 2, "what is written to a closed stream would be in the log"
+
+
+def test_a_path_that_the_locale_lacks_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("log: {directory: läufe}", encoding="utf-8")
+    variables = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [*COMMAND, "grasp", "--config", "mine.yaml", "--json", "--set", "vision.checkpoint=none"]
+    done = subprocess.run(
+        [*command, "--set", "control.feedback=current"],
+        cwd=tmp_path,
+        env=variables,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "can't use 'läufe': ascii lacks some of its letters" in json.loads(done.stdout)["error"]
 
 
 def test_an_output_that_nobody_reads_is_no_error(tmp_path: Path) -> None:
