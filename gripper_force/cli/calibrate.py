@@ -331,9 +331,11 @@ def network(
 
     logs = find_logs(data)
     with console.bar("calibrating", 2 * len(logs)) as progress:
-        model, views = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
+        model, views, left_out = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
+    console.warn_of_contact_starts(left_out, len(logs))
     values = model.model_dump(mode="json", exclude={"mean", "axes"})
-    result = {"checkpoint": str(out), **values, "view_limit": None if views is None else views.limit}
+    limit = None if views is None else views.limit
+    result = {"checkpoint": str(out), **values, "view_limit": limit, "left_out": left_out}
     console.show(result, as_json, lambda _: output.network_table(str(out), model, views))
     console.next_step("evaluate", data, "--checkpoint", out)
 

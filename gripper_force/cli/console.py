@@ -135,6 +135,12 @@ def warn_of_other_rig(differences: Iterable[str]) -> None:
         warn(f"the network learned from one rig only, and logs are of another: {'; '.join(texts)}")
 
 
+def warn_of_contact_starts(left_out: int, logs: int, remedy: str = "") -> None:
+    """Warns that logs were left out because they start in contact, if there are such logs."""
+    if left_out:
+        warn(f"left out {left_out} of {logs} logs, which start in contact{remedy}")
+
+
 def command(*words: object) -> str:
     """Returns a command of gripper-force as a shell takes it, by its words."""
     return _as_typed("gripper-force", *words)

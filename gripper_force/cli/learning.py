@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import typer
 
@@ -28,6 +28,8 @@ ContactStarts = Annotated[
         help="Also use logs that start in contact, whose first frames are no reference.",
     ),
 ]
+
+_INCLUDE: Final = "; add --include-contact-starts to use them"
 
 
 def train(
@@ -102,7 +104,7 @@ def train(
         clips = clips.without_contact_starts(settings)
         left_out = count - clips.logs
         if not quiet:
-            _warn_left_out(left_out, count)
+            console.warn_of_contact_starts(left_out, count, _INCLUDE)
     warnings: list[str] = []
     try:
         with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
@@ -217,13 +219,6 @@ def _show_trained(
     console.next_step("evaluate", "FOLDER", "--checkpoint", path)
 
 
-def _warn_left_out(left_out: int, logs: int) -> None:
-    if left_out:
-        console.warn(
-            f"left out {left_out} of {logs} logs, which start in contact; add --include-contact-starts to use them"
-        )
-
-
 def _saved(states: list[Path]) -> list[tuple[Path, int]]:
     """Returns the existing states of a training, with their times."""
     return [(state, state.stat().st_mtime_ns) for state in states if state.exists()]
@@ -278,7 +273,7 @@ def evaluate(
             out=out,
             progress=progress,
         )
-    _warn_left_out(result.left_out, len(logs))
+    console.warn_of_contact_starts(result.left_out, len(logs), _INCLUDE)
     console.warn_of_other_rig(result.other_rig)
     console.show(result, as_json, errors_table)
     if plot is not None:

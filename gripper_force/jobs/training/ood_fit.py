@@ -153,7 +153,7 @@ def calibrate_network(
     *,
     workers: int = 1,
     progress: Progress = no_progress,
-) -> tuple[OodModel, KnownViews | None]:
+) -> tuple[OodModel, KnownViews | None, int]:
     """Fits a checkpoint's out-of-distribution score, known views and claimed deviation to logs, and writes it.
 
     Args:
@@ -165,7 +165,8 @@ def calibrate_network(
         progress: Called twice for each log.
 
     Returns:
-        The score's model, and the known views; None if the logs are of too few sets. The checkpoint then keeps its own.
+        The score's model; the known views, None if the logs are of too few sets (the checkpoint then keeps its own);
+        and the number of logs that start in contact.
 
     Raises:
         DataError: The logs that show contact are fewer than `MIN_LOGS`, or of fewer than `FOLDS` sets.
@@ -176,7 +177,10 @@ def calibrate_network(
     checkpoint = load_checkpoint(source)
     networks = checkpoint.force_networks  # raises for a Gaussian process, before the logs are read
     preprocess = checkpoint.header.preprocess
-    clips = without_contact_starts(load_clips(logs, preprocess, None, workers, progress), preprocess)
+    loaded = load_clips(logs, preprocess, None, workers, progress)
+    clips = without_contact_starts(loaded, preprocess)
+    left_out = len(loaded) - len(clips)
+    progress(f"left out {left_out} logs", left_out)
     model = fit_ood(networks, checkpoint.header, clips, progress=progress)
     if model is None:
         raise DataError(
@@ -185,7 +189,7 @@ def calibrate_network(
         )
     views = fit_views(clips, preprocess)
     add_ood(source, model, views, out)
-    return model, views
+    return model, views, left_out
 
 
 def _limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:

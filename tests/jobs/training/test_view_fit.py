@@ -74,5 +74,12 @@ def test_the_command_tells_the_limit_or_that_the_views_stay(
     views = read_checkpoint(out)[2].views
     assert views is not None
     assert json.loads(done.stdout)["view_limit"] == views.limit
-    (tmp_path / next(tmp_path.glob("*.mcap")).name).unlink()
-    assert "as before: there are too few sets" in CliRunner().invoke(cli.app, call).stdout
+    assert "left out" not in done.stderr
+    first = min(tmp_path.glob("*.mcap"))
+    first.unlink()
+    clip = press(0)
+    write_log(replace(clip, name=first.stem, forces_n=clip.forces_n + 1), tmp_path)
+    done = CliRunner().invoke(cli.app, call)
+    assert "as before: there are too few sets" in done.stdout
+    assert f"warning: left out 1 of {MIN_VIEWS} logs, which start in contact" in done.stderr
+    assert f"{2 * MIN_VIEWS}/{2 * MIN_VIEWS}" in done.stderr
