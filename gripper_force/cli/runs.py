@@ -392,7 +392,7 @@ def _compare(
     frames = [one for _, one in first_pairs], [one for _, one in second_pairs]
     differences = paired_differences([r for r, _ in first_pairs], [r for r, _ in second_pairs], frames)
     if not differences and not failed:
-        raise DataError("the logs have no load cell to compare with; replay logs of runs with one")
+        raise DataError(_why_no_difference(names, first, second))
     result = {"logs": len(first_pairs), "first": names[0], "second": names[1], "differences": differences}
     if failed:
         result["failed"] = {log: str(error) for log, error in failed.items()}
@@ -409,6 +409,17 @@ def _compare(
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     console.err.print(_OPEN_LOOP, soft_wrap=True)
     console.end_with_failures(failed, len(paths))
+
+
+def _why_no_difference(names: tuple[str, str], first: "Replays", second: "Replays") -> str:
+    for name, side in zip(names, (first, second), strict=True):
+        seen, refused = (sum(getattr(r, key) for r in side.results) for key in ("seen", "refused"))
+        if 0 < refused == seen:
+            return (
+                f"the network of {name!r} knows none of the {seen} frames, so that there is nothing to compare; name "
+                "one that knows their object and view (`evaluate` also counts frames that a network does not know)"
+            )
+    return "the logs have no load cell to compare with; replay logs of runs with one"
 
 
 def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:

@@ -2,6 +2,7 @@ import dataclasses
 import gc
 import json
 import tracemalloc
+from base64 import urlsafe_b64encode
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -51,7 +52,9 @@ from gripper_force.types import (
 )
 from gripper_force.vision import batch_inference
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.checkpoint_writer import save_checkpoint
+from gripper_force.vision.checkpoint_writer import replace_header, save_checkpoint
+from gripper_force.vision.header import VIEW_LENGTH, KnownViews
+from gripper_force.vision.model_files import read_model
 
 
 def tampered(log: Path, path: Path, change: Callable[[Record], Record | None]) -> Path:
@@ -204,6 +207,33 @@ def test_log_without_a_load_cell_has_no_errors(
     assert isinstance(done.exception, DataError)
     assert "no load cell to compare with" in str(done.exception)
     assert summarise_replays(results).sources["fused"].frames == results[0].sources["fused"].frames
+
+
+def test_an_imported_recording_whose_frames_are_all_unknown_is_not_said_to_lack_a_load_cell(
+    few_logs: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    strict = tmp_path / "strict.safetensors"
+    views = KnownViews(
+        mean=urlsafe_b64encode(np.zeros(VIEW_LENGTH, np.float32).tobytes()),
+        axes=urlsafe_b64encode(np.eye(VIEW_LENGTH, 1, dtype=np.float16).tobytes()),
+        limit=1e-6,
+    )
+    header = read_model(tiny_checkpoint).header.model_copy(update={"views": views})
+    replace_header(tiny_checkpoint, header, strict)
+    logs = [str(log) for log in sorted(few_logs.iterdir())[:2]]
+    result = replay(logs[0], strict)
+    assert (result.identical, result.note) == (None, ""), "it was not written by another version"
+    assert result.refused == result.seen > 0
+    for given in (logs[:1], logs):
+        call = ["replay", *given, "--checkpoint", str(strict), "--jobs", "1"]
+        printed = CliRunner().invoke(cli.app, call, catch_exceptions=False).stdout
+        assert "does not know" in printed
+        assert "No load cell" not in printed
+        assert "version" not in printed
+    for sides in ([str(strict), str(tiny_checkpoint)], [str(tiny_checkpoint), str(strict)]):
+        done = CliRunner().invoke(cli.app, ["replay", *logs, "--compare", *sides, "--jobs", "1"])
+        assert isinstance(done.exception, DataError)
+        assert f"the network of '{strict}' knows none of the" in str(done.exception)
 
 
 def test_log_is_replayed_without_the_file_of_its_rig_profile(

@@ -151,11 +151,9 @@ def replay_table(r: "ReplayResult", report: str | None = None) -> None:
         values["commands"] = f"at most {1e3 * r.changed['goal_current_a']:.0f} mA from the run's"
         values["fused force"] = f"at most {r.changed['fused_n']:.2f} N from the run's"
     pairs({**values, "log": r.log, **({} if report is None else {"report": report})})
+    _tell_lacking(r)
     if not r.sources:
-        out.print("No load cell: force errors can't be measured.")
         return
-    if r.refused:
-        out.print(_REFUSED.format(r.refused, r.seen), soft_wrap=True)
     table = _table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples")
     for name, s in r.sources.items():
         figures = (s.mae_n, s.rmse_n, s.bias_n, s.contact_mae_n)
@@ -185,8 +183,7 @@ def replays_table(
     if notes := sorted({r.note for r in results if r.note}):
         out.print("\n".join(notes), soft_wrap=True)
     pairs({"logs": str(summary.logs), "identical": str(summary.identical)})
-    if summary.refused:
-        out.print(_REFUSED.format(summary.refused, summary.seen), soft_wrap=True)
+    _tell_lacking(summary)
     table = _table("object", "source", "MAE N", "RMSE N", "bias N", "samples")
     for name, sources in {"all": summary.sources, **summary.per_object}.items():
         for source, e in sources.items():
@@ -194,10 +191,16 @@ def replays_table(
                 escape(name), source, number(e.mae_n), number(e.rmse_n), number(e.bias_n), str(e.frames)
             )
     out.print(table)
-    if not summary.sources:
-        out.print("No load cell: force errors can't be measured.")
     if reports:
         pairs({"reports": reports[0] + (f" and {len(reports) - 1} more" if len(reports) > 1 else "")})
+
+
+def _tell_lacking(r: "ReplayResult | ReplaySummary") -> None:
+    """Says which errors are lacking, and why."""
+    if r.refused:
+        out.print(_REFUSED.format(r.refused, r.seen), soft_wrap=True)
+    if not (r.sources or 0 < r.refused == r.seen):
+        out.print("No load cell: force errors can't be measured.")
 
 
 def differences_table(first: str, second: str, differences: "dict[str, PairedDifference]") -> None:

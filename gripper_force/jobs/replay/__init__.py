@@ -152,9 +152,7 @@ def replay_each(
 
 
 def _other_vision(resolved: ResolvedConfig) -> str:
-    """Returns the difference where only the log or the replay has a network; empty without a controller."""
-    if resolved.config.gripper.nm_per_a is None:
-        return ""
+    """Returns the difference where only the log or the replay has a network."""
     return (
         "the run had a network, this has none"
         if resolved.model is None
@@ -166,6 +164,8 @@ def _note(reader: LogReader, resolved: ResolvedConfig) -> str:
     """Returns the reason why estimates or decisions may differ from the logged ones, or an empty text."""
     if reader.damaged:
         return f"{len(reader.damaged)} damaged parts of the log, of 0.1 s each, are left out"
+    if resolved.config.gripper.nm_per_a is None:  # an imported recording
+        return ""
     run_version = reader.metadata.get("version gripper-force", "")
     if run_version != __version__:
         version = run_version or "unknown"
