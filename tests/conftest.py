@@ -273,9 +273,9 @@ def loaded_log(few_logs: Path, press: Callable[..., Clip]) -> Path:
     return _write_log(replace(clip, frames=clip.frames[20:], forces_n=clip.forces_n[20:]), few_logs)
 
 
-def _write_log(clip: Clip, folder: Path) -> Path:
+def _write_log(clip: Clip, folder: Path, *keys: str) -> Path:
     path = folder / f"{clip.name}.mcap"
-    config = dump_config(load_config(None, [f"object={clip.object}"]))
+    config = dump_config(load_config(None, [f"object={clip.object}", *keys]))
     with LogWriter(path, config=config, metadata={"set": clip.set}) as log:
         for i, (gray, force_n) in enumerate(zip(clip.frames, clip.forces_n.tolist(), strict=True)):
             log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))

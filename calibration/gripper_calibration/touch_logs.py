@@ -13,7 +13,7 @@ from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
-from gripper_force.jobs.dataset import CLIP_RECORDS, CONTACT_N, Clip, read_clip, starts_in_contact
+from gripper_force.jobs.dataset import CLIP_RECORDS, CONTACT_N, Clip, known_rig, read_clip, starts_in_contact
 from gripper_force.jobs.metrics import lag_s
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
@@ -32,7 +32,7 @@ class TouchRecording:
 
     Attributes:
         touches: Labelled frames.
-        camera: Camera settings, by key of the configuration.
+        camera: Camera settings, by key of the configuration; empty if unknown.
         presses: Motor and contact force of each press.
         width_m: Distance between the jaws in each press, (N,) each.
         delay_s: Delay from the contact force to a usable estimate, without the network's computing time.
@@ -69,7 +69,9 @@ def join(recordings: dict[Path, TouchRecording]) -> TouchRecording:
     Raises:
         DataError: They are of different objects, cameras, or scales of the load cell.
     """
-    (first_path, first), parts = next(iter(recordings.items())), list(recordings.values())
+    parts = list(recordings.values())
+    of_known_rigs = {path: part for path, part in recordings.items() if part.camera}
+    first_path, first = next(iter((of_known_rigs or recordings).items()))
     expected = first.source | first.camera
     for path, part in recordings.items():
         for key, value in (part.source | part.camera).items():
@@ -130,7 +132,7 @@ def read_log(
     estimate_lag_s = lag_s(t_s, estimate_n[labelled], t_s, force_n[labelled])
     return TouchRecording(
         touches=Touches(read_out[labelled], estimate_n[labelled], force_n[labelled], numbers),
-        camera=config.rig_settings(),
+        camera=known_rig(config),
         source=_label_source(config),
         presses=presses,
         width_m=width_m,

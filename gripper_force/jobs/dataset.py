@@ -121,6 +121,11 @@ class Clip:
         return self.forces_n if math.isnan(self.stiffness) else self.forces_n / np.float32(self.stiffness)
 
 
+def known_rig(logged: Config) -> Tree:
+    """Returns the settings of a log's camera and gripper; empty for an imported recording, whose are not known."""
+    return {} if logged.gripper.nm_per_a is None else logged.rig_settings()
+
+
 def other_rig(header: "Header", logged: Config, *, is_profiled: bool) -> list[str]:
     """Returns the settings of camera and gripper in which a log differs from the one rig that a network learned from.
 
@@ -129,8 +134,7 @@ def other_rig(header: "Header", logged: Config, *, is_profiled: bool) -> list[st
         logged: Configuration of the log, with the region that is used now.
         is_profiled: True if an object profile is used, whose rig is checked instead.
     """
-    is_known = logged.gripper.nm_per_a is not None  # that of an imported recording is not
-    return header.mismatches(logged.rig_settings()) if is_known and not is_profiled else []
+    return [] if is_profiled else header.mismatches(known_rig(logged))
 
 
 def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
@@ -492,7 +496,7 @@ class StreamedClip:
                     for at in parts
                 ]
             ),
-            config.rig_settings(),
+            known_rig(config),
             _view_of(metadata),
             tuple(self._renewals),
         )

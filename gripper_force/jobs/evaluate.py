@@ -19,6 +19,7 @@ from gripper_force.jobs.dataset import (
     Clip,
     StreamedClip,
     find_logs,
+    known_rig,
     label_mask,
     other_rig,
     starts_in_contact,
@@ -252,7 +253,7 @@ def _evaluate_log(
     gain = gain_of(with_object(log_settings.control, profiles).object_ratio, logged.gripper.gain_std)
     correction = None
     if settings.calibration.object is not None:
-        correction = read_correction(log_settings, profiles, ensemble, logged.rig_settings())
+        correction = read_correction(log_settings, profiles, ensemble, known_rig(logged))
     forces_n = np.concatenate(
         [
             estimate_frames(ensemble, frames, correction, settings.vision.precision)[repeated:]

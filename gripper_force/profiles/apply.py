@@ -102,7 +102,7 @@ def read_correction(
     """
     if profiles.object is None or profiles.object_path is None or model is None:
         return None
-    mismatches = profiles.object.mismatches(model.digest, rig or config.rig_settings())
+    mismatches = profiles.object.mismatches(model.digest, config.rig_settings() if rig is None else rig)
     if profiles.object.checkpoint != model.digest:
         raise ConfigError(
             f"the object profile {profiles.object_path} was made with {mismatches[0]}, whose estimates it corrects; "

@@ -31,6 +31,10 @@ def test_short_loss_of_contact_does_not_end_a_touch() -> None:
     assert touch_numbers(np.zeros(30)).max() == 0
 
 
+KNOWN_RIG = "gripper: {nm_per_a: 1.8}"
+"""Every log of a run has it; an imported recording has not."""
+
+
 def recording(path: Path, forces_n: list[float], *, keys: str = "object: mug") -> Path:
     rng = np.random.default_rng(0)
     path.unlink(missing_ok=True)
@@ -84,7 +88,8 @@ def test_join_refuses_logs_of_different_objects_cameras_or_load_cells(
     tmp_path: Path, tiny_checkpoint: Path
 ) -> None:
     forces_n = [0.0] * 10 + [2.0] * 20
-    mug = read(recording(tmp_path / "a.mcap", forces_n), tiny_checkpoint)
+    mug = read(recording(tmp_path / "a.mcap", forces_n, keys=f"object: mug\n{KNOWN_RIG}"), tiny_checkpoint)
+    imported = read(recording(tmp_path / "imported.mcap", forces_n), tiny_checkpoint)
     for keys, sentence in (
         ("object: cup", "object cup, and .*a.mcap with mug"),
         ("object: mug\nload_cell: {n_per_raw: 2.0}", r"load_cell\.n_per_raw 2.0"),
@@ -94,12 +99,21 @@ def test_join_refuses_logs_of_different_objects_cameras_or_load_cells(
             r"vision.region \[0, 0, 48, 48\], and .*a.mcap with None",
         ),
     ):
-        other = read(recording(tmp_path / "b.mcap", forces_n, keys=keys), tiny_checkpoint)
+        other = read(recording(tmp_path / "b.mcap", forces_n, keys=f"{keys}\n{KNOWN_RIG}"), tiny_checkpoint)
         with pytest.raises(DataError, match=sentence):
-            join({tmp_path / "a.mcap": mug, tmp_path / "b.mcap": other})
+            join(
+                {
+                    tmp_path / "imported.mcap": imported,
+                    tmp_path / "a.mcap": mug,
+                    tmp_path / "b.mcap": other,
+                }
+            )
     retared = recording(tmp_path / "b.mcap", forces_n, keys="object: mug\nload_cell: {tare_raw: 2.0}")
     both = join({tmp_path / "a.mcap": mug, retared: read(retared, tiny_checkpoint)})
     assert both.touches.numbers == [0, 1]
+    assert both.camera == mug.camera, "of an imported recording the rig is not known"
+    assert imported.camera == {}
+    assert mug.camera["vision.region"] is None
 
 
 def test_log_without_contact_has_no_lag(tmp_path: Path, tiny_checkpoint: Path) -> None:
@@ -117,7 +131,7 @@ def test_log_without_labels_after_the_lead_in_is_refused(tmp_path: Path, tiny_ch
 
 
 def test_recording_without_a_servo_has_no_presses(tmp_path: Path, tiny_checkpoint: Path) -> None:
-    path = recording(tmp_path / "clip.mcap", [max(0.0, 0.2 * (i - 10)) for i in range(40)])
+    path = recording(tmp_path / "clip.mcap", [max(0.0, 0.2 * (i - 10)) for i in range(40)], keys=KNOWN_RIG)
     recorded = read(path, tiny_checkpoint)
     assert recorded.presses == []
     assert recorded.camera["camera.rate_hz"] == 30

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision, GraspController
+from gripper_force.jobs.dataset import known_rig
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.perception import FrameProcessor
@@ -68,7 +69,7 @@ def resolve_replay(config: Config) -> ResolvedConfig:
     return ResolvedConfig(
         config,
         model,
-        read_correction(config, profiles, model),
+        read_correction(config, profiles, model, known_rig(config)),
         choices=(choice,) if choice else (),
     )
 

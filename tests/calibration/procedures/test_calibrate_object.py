@@ -31,9 +31,11 @@ from gripper_force.cli import app, console
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, RequestError, UnfamiliarFrameError
-from gripper_force.jobs.dataset import load_clip
+from gripper_force.jobs.dataset import load_clip, load_clips
+from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import grasp
 from gripper_force.jobs.replay import replay
+from gripper_force.jobs.training.train import trained_on
 from gripper_force.profiles.object_profile import read_object, weights_path
 from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
@@ -43,6 +45,7 @@ from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Ph
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator, open_configured_engine
+from gripper_force.vision.preprocess import Preprocess
 
 QUICK = [
     "object=stapler",
@@ -264,6 +267,34 @@ def test_different_exposure_is_refused_or_reported(profile: Path) -> None:
         resolve(load_config(None, keys))
     notes = resolve(load_config(None, [*keys, "calibration.on_mismatch=warn"])).notes
     assert any("exposure_us 4000, not 3000" in text for _, text in notes)
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_imported_recordings_belong_to_no_rig(touched: list[Path], profile: Path, tmp_path: Path) -> None:
+    imported = []
+    for log in touched[:2]:
+        imported.append(tmp_path / log.name)
+        with LogWriter(imported[-1], config="object: stapler", metadata={}) as writer:
+            for record in LogReader(log).records(Frame, LoadCellSample):
+                writer.write(record)
+    other = [*QUICK, "camera.exposure_us=3000"]
+    own = tmp_path / "own.yaml"
+    calibrate_object(load_config(None, QUICK), "stapler", logs=imported, out=own)
+    assert read_object(own).camera == {}
+    assert not any("made with" in text for _, text in resolve(load_config(None, [*other, use(own)])).notes)
+    of_other_rig = tmp_path / "of_other_rig.yaml"
+    of_other_rig.write_text(profile.read_text().replace("exposure_us: 4000", "exposure_us: 3000"))
+    shutil.copy(weights_path(profile), weights_path(of_other_rig))
+    with pytest.raises(ConfigError, match="exposure_us 3000, not 4000"):
+        replay(touched[0], "small", overrides=[use(of_other_rig)])
+    replayed = replay(imported[0], "small", overrides=[use(of_other_rig)])
+    evaluated = evaluate(imported[:1], "small", config=load_config(None, [*QUICK, use(of_other_rig)]))
+    assert replayed.mae_n == pytest.approx(evaluated.mae_n, abs=0.05)
+    assert trained_on(load_clips(imported, Preprocess(size=32))) is None
+
+
+def use(profile: Path) -> str:
+    return f"calibration.object={profile}"
 
 
 def test_profile_with_missing_or_wrong_weights_is_refused(profile: Path, tmp_path: Path) -> None:

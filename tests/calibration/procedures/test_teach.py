@@ -53,12 +53,13 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def logs(
     press: Callable[..., Clip],
-    write_log: Callable[[Clip, Path], Path],
+    write_log: Callable[..., Path],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> list[Path]:
     """Six touches of a disc."""
     folder = tmp_path_factory.mktemp("disc")
-    return [write_log(press(seed), folder) for seed in range(6)]
+    # A log of a run has the torque constant, and an imported recording has not.
+    return [write_log(press(seed), folder, "gripper.nm_per_a=1.8") for seed in range(6)]
 
 
 @pytest.fixture(scope="module")
