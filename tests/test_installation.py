@@ -21,6 +21,7 @@ from packaging.utils import canonicalize_name
 
 import gripper_force as gf
 from gripper_force.cli.configuration import shipped_files
+from gripper_force.jobs import view
 from gripper_force.plugins import EXTRAS
 from gripper_force.runtime import backends
 from gripper_force.vision.engines import ENGINES
@@ -419,6 +420,12 @@ def own_class_modules() -> list[str]:
     return sorted({path.partition(":")[0] for table in built_in for path in table.values() if path})
 
 
+def test_the_oldest_viewers_are_those_of_the_extra() -> None:
+    extra = [Requirement(text) for text in PROJECT["optional-dependencies"]["view"]]
+    oldest = {f"{viewer}-sdk": f">={version}" for viewer, version in view.OLDEST.items()}
+    assert {one.name: str(min(one.specifier, key=lambda s: s.operator != ">=")) for one in extra} == oldest
+
+
 def test_optional_packages_are_reached_only_lazily(trees: Trees) -> None:
     """Commands, the runtime and every class that a run names load the core's packages, and their own one."""
     own = {
@@ -564,7 +571,10 @@ def test_the_image_installs_no_more_than_make_grasp() -> None:
     """The same system packages, and extras of which none brings PyTorch."""
     makefile, dockerfile = (ROOT / "Makefile").read_text(), (ROOT / "Dockerfile").read_text()
     packages = re.search(r"EGL_PACKAGES := (.+)", makefile)
-    ours, images = (re.search(r"/installed: EXTRAS := (.+)", makefile), re.search(r"/src\[(.+)\]", dockerfile))
+    ours, images = (
+        re.search(r"/installed: EXTRAS := (.+)", makefile),
+        re.search(r"/src\[(.+)\]", dockerfile),
+    )
     assert packages is not None
     assert packages[1] in dockerfile
     assert ours is not None

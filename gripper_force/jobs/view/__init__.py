@@ -5,11 +5,13 @@ A viewer runs in a process of its own and reads the log file, so it can't delay 
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from shlex import quote
 from typing import Any, Final, Protocol
@@ -21,6 +23,9 @@ from gripper_force.types import Record
 
 VIEWERS: Final = ("rerun", "foxglove")
 """Viewers, each with the name of the module that it needs. The first is the default."""
+
+OLDEST: Final = {"rerun": "0.41", "foxglove": "0.30"}
+"""Oldest version of each SDK that works, as in ``pyproject.toml``. Other packages, such as LeRobot, bring others."""
 
 FOXGLOVE_LAYOUT: Final = Path(__file__).with_name("foxglove_layout.json")
 """Layout to import in Foxglove, for live data and for log files."""
@@ -47,11 +52,22 @@ def require(viewer: str) -> None:
     """Checks that a viewer is known and installed.
 
     Raises:
-        ConfigError: It is not.
+        ConfigError: It is not, or too old.
     """
     if viewer not in VIEWERS:
         raise ConfigError(f"{viewer!r} is not a viewer; use one of {', '.join(VIEWERS)}")
     plugins.require(viewer, f"the viewer {viewer}")
+    package, oldest = f"{viewer}-sdk", OLDEST[viewer]
+    if _release(installed := metadata.version(package)) < _release(oldest):
+        raise ConfigError(
+            f"the viewer {viewer} needs {package} {oldest}, but {installed} is installed; pip install "
+            "'gripper-force[view]', in an environment of its own if another package needs the old one"
+        )
+
+
+def _release(version: str) -> list[int]:
+    """Returns the first two numbers of a version."""
+    return [int(number) for number in re.findall(r"\d+", version)[:2]]
 
 
 class GrowingLog(LogReader):

@@ -115,6 +115,16 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, log: Path) ->
     assert not (log.parent / "none").exists()  # nothing ran
 
 
+@pytest.mark.parametrize("viewer", view.VIEWERS)
+def test_a_viewer_that_is_too_old_is_refused(viewer: str, monkeypatch: pytest.MonkeyPatch, log: Path) -> None:
+    monkeypatch.setattr(plugins, "find_spec", lambda _: object())
+    monkeypatch.setattr("importlib.metadata.version", {f"{viewer}-sdk": "0.26.2"}.__getitem__)
+    message = rf"the viewer {viewer} needs {viewer}-sdk {view.OLDEST[viewer]}, but 0.26.2 is installed"
+    fails(ConfigError, message, "view", log, "--viewer", viewer)
+    monkeypatch.setattr("importlib.metadata.version", {f"{viewer}-sdk": view.OLDEST[viewer]}.__getitem__)
+    view.require(viewer)
+
+
 def test_an_unknown_viewer_and_a_view_of_trials_are_refused(log: Path) -> None:
     fails(ConfigError, "'rviz' is not a viewer; use one of rerun, foxglove", "view", log, "--viewer", "rviz")
     fails(ConfigError, "--view shows one grasp", "grasp", "--trials", "2", "--view")
