@@ -124,7 +124,8 @@ def evaluate(
             profiles of another rig than a log's. Default: the defaults.
         include_contact_starts: Also use logs that start in contact. Their reference frames are wrong, and so
             are the estimates.
-        workers: Processes to use. Results do not depend on them.
+        workers: Processes to use. Results do not depend on them. With several, a program needs ``if __name__ ==
+            "__main__":`` before this call, because each process imports it.
         ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
         plot: Figure to write: estimates and errors against the load cell; None for none.
         out: Folder for a summary and the estimates, see `gripper_force.jobs.summary_files`; None for none.

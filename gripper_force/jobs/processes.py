@@ -28,6 +28,11 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _THREAD_S: Final = 1.0
 """Longest wait for a thread whose process was killed: an interrupt can leave a future locked."""
 
+_GUARD: Final = (
+    "a program that uses several processes needs `if __name__ == '__main__':` before its calls, because each process "
+    "imports it"
+)
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -246,7 +251,7 @@ class _ProcessPool(Executor):
                 connection = None
                 reason = "was killed, perhaps for lack of memory; use fewer --jobs"
                 if code != -signal.SIGKILL:
-                    reason = f"ended with code {code}; run it again"
+                    reason = f"ended with code {code}; {_GUARD if code == 1 else 'run it again'}"
                 future.set_exception(GripperError(f"a worker process {reason}"))
             except Exception as error:
                 future.set_exception(error)
@@ -279,6 +284,8 @@ class _ProcessPool(Executor):
             raise GripperError(
                 f"a worker process can't be started: {error.strerror}; use fewer --jobs"
             ) from error
+        except RuntimeError as error:  # in a process that imports the program
+            raise GripperError(f"a worker process can't be started by another one; {_GUARD}") from error
         worker_connection.close()
         return process, connection
 

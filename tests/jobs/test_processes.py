@@ -85,6 +85,19 @@ def test_a_process_that_dies_is_an_error_and_is_replaced() -> None:
             pool.submit(os._exit, 7).result()
 
 
+def test_a_program_without_a_guard_is_told_what_it_needs(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    call = "with process_pool(1) as pool: pool.submit(abs, -1).result()"
+    program.write_text(f"from gripper_force.jobs.processes import process_pool\n{call}\n")
+    done = subprocess.run([sys.executable, program], capture_output=True, text=True)
+    assert done.returncode == 1
+    errors = [
+        line for line in done.stderr.splitlines() if line.startswith("gripper_force.errors.GripperError")
+    ]
+    assert len(errors) == 2, "of the worker, and of the program"
+    assert all("needs `if __name__ == '__main__':` before its calls" in line for line in errors)
+
+
 def kill_itself() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
