@@ -489,15 +489,15 @@ def virtual_servo(
     servo = load_settings(None, set_, {"servo.model": model}).servo
     servo_ids = ids or list(servo.ids)
     with serve_virtual_servo(servo.model, servo_ids) as server:
-        try:
+        with suppress(KeyboardInterrupt):
             console.show({"port": server.device_path, "model": servo.model, "ids": servo_ids}, as_json)
             sys.stdout.flush()
             console.err.print("serving until Ctrl-C")
-            while True:  # signal.pause() would miss a signal that comes just before it
+            # Python ignores an exception in a finaliser, and signal.pause() would miss a signal just before it.
+            while not process.is_interrupted():
                 time.sleep(0.2)
-        except KeyboardInterrupt:
-            if process.interrupt_exit_code() != 128 + signal.SIGINT:
-                raise  # SIGTERM or a lost terminal; Ctrl-C is the way to end it
+        if process.interrupt_exit_code() != 128 + signal.SIGINT:
+            raise KeyboardInterrupt  # SIGTERM or a lost terminal; Ctrl-C is the way to end it
 
 
 def _confirmed(servo: str, changes: "list[RegisterChange]", yes: bool) -> bool:

@@ -253,10 +253,13 @@ def test_ctrl_c_is_the_way_to_end_a_virtual_servo(number: int, code: int, tmp_pa
         text=True,
         start_new_session=True,
     ) as child:
-        assert child.stdout is not None
-        assert "/dev/" in child.stdout.readline()
-        child.send_signal(number)
-        out, err = child.communicate(timeout=60)
+        try:
+            assert child.stdout is not None
+            assert "/dev/" in child.stdout.readline()
+            child.send_signal(number)
+            out, err = child.communicate(timeout=60)
+        finally:
+            child.kill()
     assert (child.returncode, out) == (code, "")
     assert ("interrupted" in err.splitlines()) == bool(code)
     assert "the run was stopped" not in err
