@@ -200,7 +200,10 @@ def import_video(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import a video and its load-cell table, or a folder of them. Reports spikes, tare and lag."""
+    """Import a video and its load-cell table, or a folder of them. Reports spikes, tare and lag.
+
+    Of a folder, existing logs are kept, so an interrupted import continues.
+    """
     from gripper_force.jobs.imports import video as job
 
     region = load_settings(None, set_, {}).vision.region
@@ -211,8 +214,11 @@ def import_video(
                 f"{video} is a folder, whose recordings have their own tables and names of objects; leave out "
                 f"{'--object' if forces is None else forces}"
             )
-        with console.bar("importing", len(job.find_recordings(video))) as progress:
+        recordings = job.find_recordings(video)
+        with console.bar("importing", len(recordings)) as progress:
             summaries = job.import_folder(video, folder, region=region, align=align, progress=progress)
+        if kept := len(recordings) - len(summaries):
+            console.err.print(f"{kept} of {len(recordings)} logs existed already and were kept")
     elif forces is None:
         if not video.exists():
             raise DataError(f"there is no {video}; name a video, or a folder of recordings")

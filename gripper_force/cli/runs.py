@@ -223,10 +223,15 @@ def _run_trials(
 
 def _notes(settings: "Config", name: str) -> list[str]:
     """Returns notes on the bundle that grasps of an object use, and on differences from the rig of its profiles."""
+    from gripper_force.profiles.object_profile import user_folder
     from gripper_force.runtime.resolve import resolve
 
     resolved = resolve(settings.with_values(object=name))
-    return [text for unit, text in resolved.notes if unit == "session"]
+    notes = [text for unit, text in resolved.notes if unit == "session"]
+    unused = user_folder() / f"{name}.yaml"
+    if resolved.model is not None and resolved.config.calibration.object is None and unused.is_file():
+        notes.append(f"your profile {unused} is not used; to use it, add --profile {name}")
+    return notes
 
 
 def replay(

@@ -27,6 +27,7 @@ from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
 from gripper_force.cli.output import calibrate as output
 from gripper_force.cli.output.runs import grasp_table, trials_table
+from gripper_force.cli.runs import _notes
 from gripper_force.config import Config, load_config
 from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
@@ -1093,6 +1094,19 @@ def test_a_folder_of_videos_takes_neither_an_object_nor_a_table(run: Run, tmp_pa
     for more in (["--object", "mug"], ["forces.csv"]):
         done = run("import", "video", tmp_path, *more)
         assert (done.code, f"leave out {more[0]}" in done.err) == (2, True)
+
+
+def test_a_profile_that_is_not_used_is_named(
+    quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "user"))
+    profile = tmp_path / "user" / "gripper-force" / "objects" / "stapler.yaml"
+    profile.parent.mkdir(parents=True)
+    profile.touch()
+    note = f"your profile {profile} is not used; to use it, add --profile stapler"
+    seeing = ["camera.backend=simulated", "vision.checkpoint=small"]
+    for keys, is_named in ((seeing, True), ([*seeing, "calibration.object=none"], False), ([], False)):
+        assert (note in _notes(load_config(None, [*quick, *keys]), "stapler")) == is_named
 
 
 def test_names_are_shown_as_they_are(run: Run, current_log: Path) -> None:

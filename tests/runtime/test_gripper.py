@@ -1187,9 +1187,9 @@ def test_a_gripper_that_is_lost_is_closed(
     assert (process._interrupts, signal.getsignal(signal.SIGINT)) == ([], before)
     assert opening[0]._ended.wait(60)
     assert torque(server) == 0
-    thread, kept = opening[0]._thread, weakref.ref(opening.pop())
-    assert thread is not None
-    thread.join()
+    assert opening[0]._thread is not None
+    opening[0]._thread.join()
+    kept = weakref.ref(opening.pop())
     gc.collect()
     assert kept() is None
     with gf.open_gripper(overrides=sets) as again:  # the port is free

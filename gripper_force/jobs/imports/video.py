@@ -68,7 +68,7 @@ def import_folder(
     align: bool = True,
     progress: Progress = no_progress,
 ) -> list[ImportSummary]:
-    """Imports every recording of a folder into ``out/<recording>.mcap``.
+    """Imports every recording of a folder that has no log yet into ``out/<recording>.mcap``.
 
     Args:
         folder: Folder with recordings, see above.
@@ -77,14 +77,18 @@ def import_folder(
         align: As for `import_video`.
         progress: Called after each recording.
 
+    Returns:
+        Summaries of the new logs.
+
     Raises:
         DataError: There is no recording, or one lacks its table or is not usable.
-        LogError: A log exists already or can't be written.
+        LogError: A log can't be written.
     """
     summaries = []
     for name, video, forces in find_recordings(folder):
         log = out / f"{name}.mcap"
-        summaries.append(import_video(video, forces, log, name=name, region=region, align=align))
+        if not log.exists():
+            summaries.append(import_video(video, forces, log, name=name, region=region, align=align))
         progress(name)
     return summaries
 

@@ -1,3 +1,4 @@
+import json
 import shutil
 from pathlib import Path
 
@@ -6,7 +7,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from gripper_force.cli import app
 from gripper_force.config import config_from
 from gripper_force.errors import ConfigError, DataError, LogError
 from gripper_force.jobs.imports.video import (
@@ -186,9 +189,25 @@ def test_undecodable_video_raises(folder: Path, tmp_path: Path) -> None:
 
 
 def test_existing_log_is_not_overwritten(folder: Path, tmp_path: Path) -> None:
-    import_folder(tmp_path, tmp_path / "out")
+    log = tmp_path / "x.mcap"
+    import_video(folder / "video.avi", folder / "load_cell.csv", log)
     with pytest.raises(LogError, match="it exists already"):
-        import_folder(folder.parent, tmp_path / "out")
+        import_video(folder / "video.avi", folder / "load_cell.csv", log)
+
+
+def test_a_folder_that_has_grown_is_continued(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (first,) = import_folder(tmp_path, tmp_path / "logs")
+    before = first.log.read_bytes()
+    shutil.copytree(folder, tmp_path / "2024-01-31_foam_brick_3")
+    done = CliRunner().invoke(app, ["import", "video", str(tmp_path), "--out", "logs", "--json"])
+    assert done.exit_code == 0, done.stderr
+    (second,) = json.loads(done.stdout)["logs"]
+    assert Path(second["log"]).name == "2024-01-31_foam_brick_3.mcap"
+    assert "1 of 2 logs existed already and were kept" in done.stderr
+    assert first.log.read_bytes() == before
 
 
 def test_table_may_start_after_video(folder: Path, tmp_path: Path) -> None:
