@@ -96,9 +96,8 @@ def main() -> NoReturn:
         no_folder = isinstance(error, FileExistsError | NotADirectoryError)
         reason = "a file is where a folder must be" if no_folder else error.strerror
         _fail(f"can't use {error.filename}: {reason}; check the path, and who may read and write there")
-    except (
-        UnicodeEncodeError
-    ) as error:  # of a path that a file names; one of the command line can be passed on
+    except UnicodeEncodeError as error:
+        # Of a path that a file names; one of the command line can be passed on.
         _fail(f"can't use {error.object!r}: {error.encoding} lacks some of its letters; set LC_ALL=C.UTF-8")
     except BaseException as end:
         if isinstance(end, SystemExit):

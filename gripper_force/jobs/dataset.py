@@ -99,7 +99,7 @@ class Clip:
         """Returns the parts that the run compared with a reference each, which begin with the frames of theirs."""
         if not self.renewals:
             return [self]
-        lead = preprocess.reference_frames if preprocess.reference else 0
+        lead = _reference_count(preprocess)
         parts = []
         for begin, end in pairwise((0, *self.renewals, len(self.frames))):
             at = slice(max(begin - lead, 0), end)
@@ -419,7 +419,7 @@ class StreamedClip:
         Each part must be used up before the next one. Raises as `frames`.
         """
         frames = self.frames()
-        last: deque[Gray] = deque(maxlen=self._lead)
+        last: deque[Gray] = deque(maxlen=_reference_count(self._preprocess))
         following = next(frames, None)
 
         def part(count: int) -> Iterator[Gray]:
@@ -432,10 +432,6 @@ class StreamedClip:
 
         while following is not None:
             yield len(last), part(len(self._renewals))
-
-    @property
-    def _lead(self) -> int:
-        return self._preprocess.reference_frames if self._preprocess.reference else 0
 
     def frames(self) -> Iterator[Gray]:
         """Yields the frames, cropped and downscaled, (S, S) uint8, once.
@@ -450,7 +446,7 @@ class StreamedClip:
             is_renewed = finder.is_renewed(record)
             if isinstance(record, Frame):
                 # An earlier request changes nothing: the reference is still being collected.
-                if is_renewed and len(self._t_ns) >= max(self._lead, 1):
+                if is_renewed and len(self._t_ns) >= max(_reference_count(self._preprocess), 1):
                     self._renewals.append(len(self._t_ns))
                 self._t_ns.append(record.t_ns)
                 yield downscale(record.gray, self._region, self._preprocess.size)
@@ -565,6 +561,10 @@ def stiffness_floor_n(forces_n: npt.NDArray[np.floating], stiffness: float) -> n
     """
     floor_n: npt.NDArray[np.floating] = np.abs(forces_n) * abs(1 - 1 / stiffness)
     return floor_n
+
+
+def _reference_count(preprocess: "Preprocess") -> int:
+    return preprocess.reference_frames if preprocess.reference else 0
 
 
 def _names(clips: Iterable[Clip], key: str) -> list[str]:

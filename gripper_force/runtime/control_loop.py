@@ -92,9 +92,8 @@ class ControlLoop:
                 while not (self._background or request.result.done()):
                     self.step()
                 request.result.exception()  # waits
-            except (
-                BaseException
-            ):  # an interrupt: jaws that close must not go on; an object that they grip stays
+            except BaseException:
+                # An interrupt: jaws that close must not go on; an object that they grip stays.
                 with contextlib.suppress(GripperError):
                     if not (request.kind == RequestKind.RELEASE or self.state.phase in GRIPPING):
                         self.stop()
