@@ -131,14 +131,19 @@ def _fail_without_file(error: OSError) -> NoReturn:
     """Ends the command after an error that names no file; one of another kind than those of an output is raised."""
     if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         raise error
-    for name in ("stdout", "stderr"):
-        try:
-            getattr(sys, name).flush()
-        except OSError:  # Python would write the rest at its end, and fail again
-            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
+    _drop_unwritten_output()
     if error.errno == errno.EPIPE:  # of `gripper-force ... | head`
         sys.exit(1)
     _fail(f"can't write the output: {error.strerror}; make space, or send it elsewhere")
+
+
+def _drop_unwritten_output() -> None:
+    """Drops what a standard stream can't write: Python would write it at its end, fail again, and exit with 120."""
+    for name in ("stdout", "stderr"):
+        try:
+            getattr(sys, name).flush()
+        except OSError:
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
 
 
 def _fail(message: str) -> NoReturn:
@@ -146,6 +151,7 @@ def _fail(message: str) -> NoReturn:
         console.err.print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
     with suppress(OSError):
         _print_json_error(message)
+    _drop_unwritten_output()
     # An interrupt can appear as an error of what it met, such as an import.
     sys.exit(process.interrupt_exit_code() if process.is_interrupted() else 2)
 

@@ -134,7 +134,11 @@ def test_an_output_on_a_full_disk_is_one_sentence(arguments: str, tmp_path: Path
     assert (done.returncode, done.stderr) == (2, sentence)
 
 
-def test_messages_on_a_full_disk_do_not_hide_the_result(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_messages_on_a_full_disk_do_not_hide_the_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unbuffered: str
+) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     command = [*COMMAND, "grasp", "--set", "no_such_key=1", "--json"]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=full, text=True)
