@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import cv2
@@ -1094,6 +1095,17 @@ def test_a_folder_of_videos_takes_neither_an_object_nor_a_table(run: Run, tmp_pa
     for more in (["--object", "mug"], ["forces.csv"]):
         done = run("import", "video", tmp_path, *more)
         assert (done.code, f"leave out {more[0]}" in done.err) == (2, True)
+
+
+def test_a_virtual_servo_ends_by_a_signal_whose_exception_was_lost(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sleep(_: float) -> None:
+        assert not process.is_interrupted()
+        process._received.append((signal.SIGINT, False, 0.0))
+
+    monkeypatch.setattr("gripper_force.cli.runs.time", SimpleNamespace(sleep=sleep))
+    assert run("virtual-servo", "--json").code == 0
 
 
 def test_a_profile_that_is_not_used_is_named(

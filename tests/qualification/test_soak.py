@@ -55,7 +55,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def grasped(config: Config, seconds: int = 1) -> dict[str, Any]:
-    """Stands in for a grasp: writes a log of this length, without a gripper."""
+    """Writes a log of this length in place of a grasp, without a gripper."""
     with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
         for t_s in (0, seconds):
             log.write(Event(t_s * NS_PER_S, "session", "tick"))

@@ -61,7 +61,7 @@ def require(viewer: str) -> None:
     if _release(installed := metadata.version(package)) < _release(oldest):
         raise ConfigError(
             f"the viewer {viewer} needs {package} {oldest}, but {installed} is installed; pip install "
-            "'gripper-force[view]', in an environment of its own if another package needs the old one"
+            "'gripper-force[view]', in a separate environment if another package needs the old one"
         )
 
 
