@@ -172,6 +172,11 @@ class GripperConfig(Section):
         description="largest ratio of the true torque constant to nm_per_a that the force limit must allow for; 1.1 "
         "is enough after calibrate servo",
     )
+    position_bound_rad: NonNegative = Field(
+        0.5,
+        description="with a linkage: largest error of open_position_rad that the limits of force and speed must allow "
+        "for; 0.05 is enough after calibrate jaws",
+    )
 
 
 class CameraConfig(Section):

@@ -33,7 +33,7 @@ class FrictionAllowance:
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
-        self._safe_n = _UNKNOWN_SHARE * config.force_limit_n / transmission.torque_constant_bound
+        self._safe_n = _UNKNOWN_SHARE * config.force_limit_n / transmission.largest_force_bound
         self._breakaway_n = transmission.friction_n + _BREAKAWAY_N
         self.shown_n = math.inf
         self.was_shown_in_grasp = self._starts_open = self._has_moved = False

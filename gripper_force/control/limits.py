@@ -29,9 +29,9 @@ _TARGET_SHARE = 0.9
 """Largest target as a share of the force limit: a tenth is left for overshoot."""
 
 
-def largest_target_n(force_limit_n: float, torque_constant_bound: float) -> float:
-    """Returns the largest target force that is allowed with a force limit and a bound on the torque constant."""
-    return _TARGET_SHARE * force_limit_n / torque_constant_bound
+def largest_target_n(force_limit_n: float, force_bound: float) -> float:
+    """Returns the largest target force that is allowed with a force limit and a bound on the true motor force."""
+    return _TARGET_SHARE * force_limit_n / force_bound
 
 
 def rounded_down(force_n: float) -> str:
@@ -130,7 +130,7 @@ class Limits:
     def ceiling_a(self, friction_n: float, present_rad: float) -> float:
         """Returns the largest current that the force limit and the servo's current limit allow at a servo angle."""
         max_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
-        limit_n = _CEILING_SHARE * self._force_limit_n / self._transmission.torque_constant_bound
+        limit_n = _CEILING_SHARE * self._force_limit_n / self._transmission.force_bound(present_rad)
         max_n = limit_n + min(max(friction_n, 0.0), max_friction_n)
         return min(self._current_limit_a, abs(self._transmission.current_a(max_n, present_rad)))
 

@@ -53,6 +53,10 @@ class RackAndPinion:
         """Returns half of the width's decrease per radian: the travel of each of two jaws."""
         return self.radius_m
 
+    def jaw_m_per_rad_range(self, closing_rad: float, error_rad: float) -> tuple[float, float]:
+        """Returns the least and the greatest travel per radian within an error of the closing angle."""
+        return self.radius_m, self.radius_m
+
 
 @dataclass(frozen=True, slots=True)
 class TabulatedLinkage:
@@ -90,6 +94,13 @@ class TabulatedLinkage:
         i, share = self._interval(closing_rad)
         share = min(max(share, 0.0), 1.0)
         return self.jaw_m_per_rads[i] + share * (self.jaw_m_per_rads[i + 1] - self.jaw_m_per_rads[i])
+
+    def jaw_m_per_rad_range(self, closing_rad: float, error_rad: float) -> tuple[float, float]:
+        """Returns the least and the greatest travel per radian within an error of the closing angle."""
+        first, _ = self._interval(closing_rad - error_rad)
+        last, _ = self._interval(closing_rad + error_rad)
+        inside = self.jaw_m_per_rads[first : last + 2]
+        return min(inside), max(inside)
 
     def _interval(self, closing_rad: float) -> tuple[int, float]:
         i = min(max(int(closing_rad / self.step_rad), 0), len(self.widths_m) - 2)

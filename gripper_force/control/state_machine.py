@@ -150,7 +150,7 @@ class GraspController:
         self._hold_m_s = hold_speed_m_s(config, transmission)
         self._slip = SlipMonitor(config, self._hold_m_s)
         self._visual_check = VisualCheck(config)
-        self._largest_target_n = largest_target_n(config.force_limit_n, transmission.torque_constant_bound)
+        self._largest_target_n = largest_target_n(config.force_limit_n, transmission.largest_force_bound)
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
         self._estimate = FusedForce(
             0, 0.0, transmission.bias_std_n(0.0), 0.0, 0.0, transmission.friction_n, EstimateSource.CURRENT

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 from gripper_force.config import GripperConfig
 from gripper_force.control.linkage import Linkage, make_linkage
@@ -34,6 +35,7 @@ class Transmission:
         friction_std: Standard deviation of true friction, as a share of `friction_n`.
         torque_constant_std: Standard deviation of the true torque constant, as a share of the nominal.
         torque_constant_bound: Largest plausible ratio of the true torque constant to the nominal.
+        position_bound_rad: Largest plausible error of `open_position_rad`.
     """
 
     linkage: Linkage
@@ -46,6 +48,7 @@ class Transmission:
     friction_std: float = 0.25
     torque_constant_std: float = 0.06
     torque_constant_bound: float = 1.4
+    position_bound_rad: float = 0.5
 
     @classmethod
     def from_config(
@@ -68,6 +71,7 @@ class Transmission:
             friction_std=gripper.friction_std,
             torque_constant_std=gripper.gain_std,
             torque_constant_bound=gripper.gain_bound,
+            position_bound_rad=gripper.position_bound_rad,
         )
 
     @property
@@ -98,10 +102,23 @@ class Transmission:
         """Returns half of the width's decrease per radian at a servo angle."""
         return self.linkage.jaw_m_per_rad(self._closing_rad(position_rad))
 
+    def jaw_m_per_rad_range(self, position_rad: float) -> tuple[float, float]:
+        """Returns the least and the greatest travel of a jaw per radian that are plausible at a servo angle."""
+        return self.linkage.jaw_m_per_rad_range(self._closing_rad(position_rad), self.position_bound_rad)
+
+    def force_bound(self, position_rad: float) -> float:
+        """Returns the largest plausible ratio of the true motor force to the nominal at a servo angle."""
+        least_m_per_rad, _ = self.jaw_m_per_rad_range(position_rad)
+        return self.torque_constant_bound * (self.jaw_m_per_rad(position_rad) / least_m_per_rad)
+
+    @property
+    def largest_force_bound(self) -> float:
+        """The largest `force_bound` in the travel."""
+        return max(map(self.force_bound, self._travel_rad()))
+
     def impact_m_s(self, force_n: float) -> float:
         """Returns the largest jaw speed whose impact on a hard object stays within a force, anywhere in the travel."""
-        positions_rad = (self.position_rad(self.open_width_m * i / 32) for i in range(33))
-        return _IMPACT_RAD_S_PER_N * force_n * min(map(self.jaw_m_per_rad, positions_rad))
+        return _IMPACT_RAD_S_PER_N * force_n * min(map(self.jaw_m_per_rad, self._travel_rad()))
 
     def n_per_a(self, position_rad: float) -> float:
         """Returns the motor force at each jaw per ampere at a servo angle."""
@@ -125,3 +142,12 @@ class Transmission:
 
     def _closing_rad(self, position_rad: float) -> float:
         return self.closing_sign * (position_rad - self.open_position_rad)
+
+    def _travel_rad(self) -> list[float]:
+        return [self.position_rad(self.open_width_m * i / 32) for i in range(33)]
+
+
+@lru_cache(maxsize=8)
+def largest_force_bound(gripper: GripperConfig) -> float:
+    """Returns the largest plausible ratio of the true motor force to the nominal, anywhere in the travel."""
+    return Transmission.from_config(gripper, 1.0).largest_force_bound

@@ -246,10 +246,10 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int, serv
     drawn = _draw_far(random, config, truth, is_sequence=is_sequence)
     drawn = replace(drawn, mass_kg=servos * drawn.mass_kg)  # of one servo, a jaw has half
     if index % _NEAR == _STREAM_REMAINDER:
-        max_n = largest_target_n(drawn.force_limit_n, truth.torque_constant_bound)
+        max_n = largest_target_n(drawn.force_limit_n, truth.largest_force_bound)
         return replace(drawn, requests=tuple(_draw_stream(random, max_n, truth.open_width_m)))
     if index % _NEAR in _NEAR_REMAINDERS:
-        return _move_near(random, drawn, truth.open_width_m)
+        return _move_near(random, drawn, truth)
     return drawn
 
 
@@ -259,13 +259,14 @@ def _draw_far(random: _Random, config: ControlConfig, truth: Transmission, *, is
     rng, width_m = random.generator, truth.open_width_m
     reach = _REACH_SHARE if is_sequence else 1.0
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
-    max_n = largest_target_n(force_limit_n, truth.torque_constant_bound)
+    max_n = largest_target_n(force_limit_n, truth.largest_force_bound)
+    min_n = min(0.5, max_n)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
     return Draw(
         force_limit_n=force_limit_n,
         approach_m_s=rarely(0.5, log_between(0.01, 0.04), config.approach_speed_m_s),
-        target_n=between(0.5, max_n),
-        then_n=rarely(0.5, between(0.5, max_n), math.nan),
+        target_n=between(min_n, max_n),
+        then_n=rarely(0.5, between(min_n, max_n), math.nan),
         then_s=between(1.0, 4.0),
         feedback=str(rng.choice(["fused", "current", "vision"])),
         on_slip=str(rng.choice(["regrip", "hold", "open"])),
@@ -298,14 +299,15 @@ def _draw_far(random: _Random, config: ControlConfig, truth: Transmission, *, is
 def _draw_request(random: _Random, max_n: float, open_width_m: float) -> TimedRequest:
     kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
     kind = RequestKind(random.generator.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
-    value = random.between(_MIN_N, max_n) if kind == RequestKind.GRASP else random.between(0.0, open_width_m)
+    low_n = min(_MIN_N, max_n)
+    value = random.between(low_n, max_n) if kind == RequestKind.GRASP else random.between(0.0, open_width_m)
     return TimedRequest(random.log_between(0.05, 8.0), kind, value)
 
 
 def _draw_stream(random: _Random, max_n: float, open_width_m: float) -> Iterator[TimedRequest]:
     """Draws a stream of requests, as of a policy."""
     period_s = random.log_between(0.005, 0.1)
-    ranges = {RequestKind.GRASP: (_MIN_N, max_n), RequestKind.MOVE: (0.0, open_width_m)}
+    ranges = {RequestKind.GRASP: (min(_MIN_N, max_n), max_n), RequestKind.MOVE: (0.0, open_width_m)}
     kind, values = RequestKind.GRASP, {key: random.between(*bounds) for key, bounds in ranges.items()}
     for _ in range(round(_STREAM_S / period_s)):
         if random.generator.uniform() < _STREAM_CHANGES_HZ * period_s:
@@ -316,20 +318,21 @@ def _draw_stream(random: _Random, max_n: float, open_width_m: float) -> Iterator
         yield TimedRequest(period_s, kind, min(max(values.get(kind, 0.0) + noise, low), high))
 
 
-def _move_near(random: _Random, drawn: Draw, open_width_m: float) -> Draw:
+def _move_near(random: _Random, drawn: Draw, truth: Transmission) -> Draw:
     """Returns the case with jaws that begin near the object, and a force limit and targets that suit this."""
     gap_m = random.rarely(0.3, 0.0, random.between(0.0, _GAP_M))
-    to_m = random.between(0.0, open_width_m / 4) if drawn.contact_m == _GONE_M else drawn.contact_m
+    to_m = random.between(0.0, truth.open_width_m / 4) if drawn.contact_m == _GONE_M else drawn.contact_m
     limit_n = random.log_between(*_NEAR_LIMIT_N)
     scale = limit_n / drawn.force_limit_n
+    min_n = min(_MIN_N, largest_target_n(limit_n, truth.largest_force_bound))
     return replace(
         drawn,
         begins_m=max(to_m - gap_m, 0.0),
         force_limit_n=limit_n,
-        target_n=max(scale * drawn.target_n, _MIN_N),
-        then_n=max(scale * drawn.then_n, _MIN_N),  # not a number stays
+        target_n=max(scale * drawn.target_n, min_n),
+        then_n=max(scale * drawn.then_n, min_n),  # not a number stays
         requests=tuple(
-            step._replace(value=max(scale * step.value, _MIN_N)) if step.kind == RequestKind.GRASP else step
+            step._replace(value=max(scale * step.value, min_n)) if step.kind == RequestKind.GRASP else step
             for step in drawn.requests
         ),
     )

@@ -1070,7 +1070,7 @@ def test_a_calibration_replaces_a_damaged_rig_profile_of_its_file(run: Run) -> N
 def test_commands_before_the_first_calibration_need_no_rig_profile(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    jaws = JawsResult(0.0, 2.0, 0.01, (1.0, 1.0), (1.0, 1.0), 1, 0.0, 0.09, 1.0)
+    jaws = JawsResult(0.0, 2.0, 0.01, (1.0, 1.0), (1.0, 1.0), 1, 0.0, 0.09, 1.0, None)
     monkeypatch.setattr(calibrate_jaws, "calibrate_jaws", lambda *_, **__: jaws)
     new = ("--set", "calibration.rig=rig.yaml", "--set", "object=none", "--set", "sim.detail=coarse")
     assert "closing_sign: 1" in run("calibrate", "jaws", "--yes", *new).out

@@ -71,6 +71,7 @@ class JawsResult:
         open_position_rad: Proposed `gripper.open_position_rad`.
         open_width_m: Proposed `gripper.open_width_m`.
         friction_n: Proposed `gripper.friction_n`.
+        position_bound_rad: Proposed `gripper.position_bound_rad`; None for a rack, which needs none.
     """
 
     open_end_rad: float
@@ -82,6 +83,7 @@ class JawsResult:
     open_position_rad: float
     open_width_m: float
     friction_n: float
+    position_bound_rad: float | None
 
     @property
     def yaml(self) -> str:
@@ -92,6 +94,7 @@ class JawsResult:
             f"  open_position_rad: {self.open_position_rad:.4f}\n"
             f"  open_width_m: {self.open_width_m:.4f}\n"
             f"  friction_n: {self.friction_n:.2f}\n"
+            + (f"  position_bound_rad: {self.position_bound_rad:.2f}\n" if self.position_bound_rad else "")
         )
 
 
@@ -111,9 +114,12 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
         DataError: The jaws do not move, have no ends, or the results contradict each other.
     """
     # The configured angle may be wrong, so the travel is assumed around zero, where every servo can be.
-    linkage = Transmission.from_config(config.gripper, 1.0).linkage
-    middle_rad = -config.gripper.closing_sign * linkage.closing_rad(0.0) / 2
-    config = servo_alone(config).with_values(gripper={"open_position_rad": middle_rad})
+    travel_rad = Transmission.from_config(config.gripper, 1.0).linkage.closing_rad(0.0)
+    unknown = {
+        "open_position_rad": -config.gripper.closing_sign * travel_rad / 2,
+        "position_bound_rad": travel_rad,
+    }
+    config = servo_alone(config).with_values(gripper=unknown)
     config = resolve(config, vision=False).config
     prompt("Take everything from between the jaws and open them by hand")
     with open_devices(config) as devices, _torque_on(config, devices, progress) as jaws:
@@ -129,7 +135,7 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
     open_rad, closed_rad = (low_rad, high_rad) if sign > 0 else (high_rad, low_rad)
     (closing_start_n, closing_n), (opening_start_n, opening_n) = friction
     _check_friction((closing_start_n, opening_start_n), (closing_n, opening_n))
-    width_m, position_rad = _proposal(config, open_rad, closed_rad, sign)
+    width_m, position_rad, bound_rad = _proposal(config, open_rad, closed_rad, sign)
     return JawsResult(
         open_end_rad=open_rad,
         closed_end_rad=closed_rad,
@@ -140,6 +146,7 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
         open_position_rad=position_rad,
         open_width_m=width_m,
         friction_n=(closing_n + opening_n) / 2,
+        position_bound_rad=bound_rad,
     )
 
 
@@ -176,8 +183,14 @@ def _check_friction(breakaway_n: tuple[float, float], running_n: tuple[float, fl
         )
 
 
-def _proposal(config: Config, open_rad: float, closed_rad: float, sign: int) -> tuple[float, float]:
-    """Returns width and angle of the open jaws. Raises `DataError` if the travel contradicts the configuration."""
+def _proposal(
+    config: Config, open_rad: float, closed_rad: float, sign: int
+) -> tuple[float, float, float | None]:
+    """Returns width, angle and bound of the angle's error of the open jaws.
+
+    Raises:
+        DataError: The travel contradicts the configuration.
+    """
     gripper = config.gripper
     travel_rad = abs(closed_rad - open_rad)
     linkage = Transmission.from_config(gripper, 1.0).linkage
@@ -189,9 +202,10 @@ def _proposal(config: Config, open_rad: float, closed_rad: float, sign: int) -> 
             "gripper.pinion_radius_m or gripper.linkage, and that nothing lies between the jaws"
         )
     if gripper.linkage.kind != "rack":  # its geometry determines the width
-        return gripper.open_width_m, closed_rad - sign * expected_rad
+        bound_rad = _GIVES_RAD + abs(travel_rad - expected_rad)
+        return gripper.open_width_m, closed_rad - sign * expected_rad, bound_rad
     inset_rad = _INSET_M / (2 * gripper.pinion_radius_m)
-    return 2 * gripper.pinion_radius_m * (travel_rad - inset_rad), open_rad + sign * inset_rad
+    return 2 * gripper.pinion_radius_m * (travel_rad - inset_rad), open_rad + sign * inset_rad, None
 
 
 @contextmanager

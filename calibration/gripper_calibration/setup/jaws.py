@@ -57,6 +57,10 @@ def jaws(task: Task) -> StepResult:
             f"{result.running_n[0]:.2f} N closing, {result.running_n[1]:.2f} N opening, homed {today}",
         ),
     }
+    if result.position_bound_rad is not None:
+        values["gripper.position_bound_rad"] = Found(
+            round(result.position_bound_rad, 2), "of the ends and the linkage"
+        )
     found_keys = (key.partition(".") for key in values)
     gripper = {key: values[f"gripper.{key}"].value for part, _, key in found_keys if part == "gripper"}
     resolve(config.with_values(gripper=gripper), vision=False)  # the travel must lie within the servo's turn
