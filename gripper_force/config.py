@@ -175,7 +175,7 @@ class GripperConfig(Section):
     position_bound_rad: NonNegative = Field(
         0.5,
         description="with a linkage: largest error of open_position_rad that the limits of force and speed must allow "
-        "for; 0.05 is enough after calibrate jaws",
+        "for; calibrate jaws proposes a smaller one",
     )
 
 
@@ -375,7 +375,7 @@ class ControlConfig(Section):
         le=HARD_FORCE_LIMIT_N,
         allow_inf_nan=False,
         description="above this force the current is reduced, and after 0.25 s the grasp ends as a fault; "
-        "the largest target is 0.9 / gripper.gain_bound of it",
+        "the largest target is 0.9 / gripper.gain_bound of it, and less with a linkage (gripper.position_bound_rad)",
     )
     approach_speed_m_s: Positive = Field(
         0.025,

@@ -78,10 +78,10 @@ class ResolvedConfig:
             raise RequestError(f"a target of {target_n} N is not a positive force; request more than 0 N")
         if target_n > largest_n:
             raise RequestError(
-                f"a target of {target_n:g} N is too close to control.force_limit_n {limit_n:g} N with a motor of up to "
-                f"{bound:.3g} times the force (gripper.gain_bound and, with a linkage, gripper.position_bound_rad); "
-                f"request at most {rounded_down(largest_n)} N, raise the limit, or lower the bounds after calibrate "
-                "jaws and servo"
+                f"a target of {target_n:g} N is too close to control.force_limit_n {limit_n:g} N: the motor force can "
+                f"be {bound:.3g} times the calculated one (gripper.gain_bound and, with a linkage, "
+                f"gripper.position_bound_rad); request at most {rounded_down(largest_n)} N, raise the limit, or lower "
+                "the bounds after calibrate jaws and servo"
             )
         for name, max_n in self.target_limits_n.items():
             if target_n > max_n:

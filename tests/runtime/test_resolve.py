@@ -153,7 +153,9 @@ def test_a_target_out_of_range_is_refused(target_n: float) -> None:
 
 def test_a_linkage_takes_large_targets_once_its_jaws_are_calibrated() -> None:
     viperx = Path(__file__).parents[2] / "examples/grippers/viperx_aloha.yaml"
-    with pytest.raises(RequestError, match=r"2\.\d+ times the force .*position_bound_rad.* after calibrate jaws and servo"):
+    with pytest.raises(
+        RequestError, match=r"2\.\d+ times the .*position_bound_rad.* after calibrate jaws and servo"
+    ):
         ResolvedConfig(load_config(viperx)).check_target(6.0)
     ResolvedConfig(load_config(viperx, ["gripper.position_bound_rad=0.1"])).check_target(6.0)
 

@@ -19,8 +19,8 @@ from pydantic import BaseModel
 
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.limits import largest_target_n, rounded_down
-from gripper_force.control.transmission import largest_force_bound
 from gripper_force.control.state_machine import Decision
+from gripper_force.control.transmission import largest_force_bound
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.files import unfinished
 from gripper_force.interfaces import Devices

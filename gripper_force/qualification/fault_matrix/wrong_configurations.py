@@ -15,8 +15,8 @@ import numpy as np
 
 from gripper_force.config import Config, config_from
 from gripper_force.control.limits import largest_target_n
-from gripper_force.control.transmission import largest_force_bound
 from gripper_force.control.state_machine import is_open
+from gripper_force.control.transmission import largest_force_bound
 from gripper_force.errors import ConfigError, DeviceError, GripperError, SimulationError
 from gripper_force.interfaces import WorldState
 from gripper_force.jobs.grasp import PAPER_OBJECTS
