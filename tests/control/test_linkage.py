@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, get_args
@@ -13,9 +14,11 @@ from hypothesis import strategies as st
 from gripper_force.config import ControlConfig, GripperConfig, LinkageConfig, load_config
 from gripper_force.control.limits import Limits
 from gripper_force.control.linkage import RackAndPinion, make_linkage
-from gripper_force.control.transmission import Transmission
+from gripper_force.control.speed_limit import SpeedLimit
+from gripper_force.control.transmission import Transmission, largest_force_bound
 from gripper_force.errors import ConfigError
-from gripper_force.types import ServoCommand
+from gripper_force.qualification.loop_margin.analytic_plant import POSITION_LOOP
+from gripper_force.types import ServoCommand, ServoState
 
 GRIPPERS = {
     path.stem: load_config(path).gripper
@@ -196,15 +199,24 @@ def test_any_geometry_is_refused_or_has_all_properties_of_a_linkage(kind: str, d
         assert derivative > 0
 
 
+wrong_starts = st.floats(-0.5, 0.5)
+"""Errors of the open position in rad, up to `GripperConfig.position_bound_rad`."""
+
+
+def with_true_start(believed: Transmission, error_rad: float) -> Transmission:
+    return replace(believed, open_position_rad=believed.open_position_rad + error_rad)
+
+
 @given(
     grippers,
     st.sampled_from([-1, 1]),
     st.floats(0, 1),
     st.floats(-1e3, 1e3),
     st.floats(0, 1e3),
+    wrong_starts,
 )
 def test_no_linkage_leaves_its_travel_or_the_force_limit(
-    name: str, sign: int, share: float, goal_rad: float, goal_a: float
+    name: str, sign: int, share: float, goal_rad: float, goal_a: float, error_rad: float
 ) -> None:
     one, control = transmission_of(name, closing_sign=sign), ControlConfig()
     at_rad = one.position_rad(share * one.open_width_m)
@@ -212,8 +224,33 @@ def test_no_linkage_leaves_its_travel_or_the_force_limit(
     command, _ = Limits(control, one, 1e3).apply(wanted, 0.0, 0.0, 0.0, at_rad, 60.0, may_rise=True)
     low_rad, high_rad = one.goal_range_rad
     assert low_rad <= command.goal_position_rad <= high_rad
-    force_n = one.force_n(sign * command.goal_current_a, at_rad)
+    force_n = with_true_start(one, error_rad).force_n(sign * command.goal_current_a, at_rad)
     assert force_n * one.torque_constant_bound <= 1.05 * control.force_limit_n
+
+
+@given(grippers, st.floats(0, 1), wrong_starts)
+def test_no_linkage_is_too_fast_with_a_wrong_start(name: str, share: float, error_rad: float) -> None:
+    one, speed_m_s = transmission_of(name), 0.025
+    at_rad, truth = one.position_rad(share * one.open_width_m), with_true_start(one, error_rad)
+    limit = SpeedLimit(one, POSITION_LOOP)
+    stands = ServoState(0, at_rad, 0.0, 0.0, 30.0, 12.0, 0)
+    command = limit.apply(ServoCommand(0, at_rad + 1.0, 0.1), stands, speed_m_s)
+    free_rad_s = POSITION_LOOP.gain_per_s * (command.goal_position_rad - at_rad)
+    assert truth.closing_m_s(free_rad_s, at_rad) <= 1.31 * speed_m_s
+    moves = replace(stands, velocity_rad_s=1.45 * speed_m_s / truth.jaw_m_per_rad(at_rad))
+    assert limit.apply(ServoCommand(0, at_rad + 1.0, 0.1), moves, speed_m_s).goal_position_rad == at_rad
+
+
+@pytest.mark.parametrize("name", GRIPPERS)
+def test_the_force_bound_covers_torque_constant_and_linkage(name: str) -> None:
+    one = transmission_of(name)
+    exact = replace(one, position_bound_rad=0.0)
+    assert exact.largest_force_bound == pytest.approx(1.4, rel=0.02)
+    assert one.largest_force_bound == largest_force_bound(GRIPPERS[name])
+    if GRIPPERS[name].linkage.kind == "rack":
+        assert one.largest_force_bound == 1.4
+    else:
+        assert one.largest_force_bound > 1.05 * exact.largest_force_bound
 
 
 CRANK = {"kind": "crank_slider", "crank_m": 0.022, "rod_m": 0.036, "open_crank_rad": 1.1}

@@ -72,6 +72,9 @@ def test_every_other_linkage_is_homed(name: str) -> None:
     assert result.open_width_m == config.gripper.open_width_m
     open_rad = make_linkage(config.gripper).closing_rad(result.open_width_m)
     assert result.open_position_rad == pytest.approx(open_rad, abs=0.07)
+    assert result.position_bound_rad is not None
+    assert abs(result.open_position_rad - config.gripper.open_position_rad) < result.position_bound_rad < 0.3
+    assert yaml.safe_load(result.yaml)["gripper"]["position_bound_rad"] == round(result.position_bound_rad, 2)
 
 
 def test_its_proposal_makes_a_grasp_possible() -> None:
