@@ -1,5 +1,6 @@
 """The commands that calibrate a rig and objects."""
 
+import math
 import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -327,12 +328,17 @@ def network(
     """Fit a network's out-of-distribution score, known views and claimed errors to logs of what it knows."""
     require("torch", "calibrate network")
     from gripper_force.jobs.dataset import find_logs
-    from gripper_force.jobs.training.ood_fit import calibrate_network
+    from gripper_force.jobs.training.ood_fit import UNKNOWN_FACTOR, calibrate_network
 
     logs = find_logs(data)
     with console.bar("calibrating", 2 * len(logs)) as progress:
         model, views, left_out = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
     console.warn_of_contact_starts(left_out, len(logs))
+    if (factor := math.hypot(model.std_base, model.std_growth)) > UNKNOWN_FACTOR:
+        console.warn(
+            f"the errors on these logs are up to {factor:.1f} times what the network claimed: it does not know what "
+            f"they show, and {out} accepts it now; teach the object, or train with --init"
+        )
     values = model.model_dump(mode="json", exclude={"mean", "axes"})
     limit = None if views is None else views.limit
     result = {"checkpoint": str(out), **values, "view_limit": limit, "left_out": left_out}

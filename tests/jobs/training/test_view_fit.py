@@ -4,10 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 from gripper_force import cli
 from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.training import ood_fit
 from gripper_force.jobs.training.ood_fit import calibrate_network
 from gripper_force.jobs.training.view_fit import MIN_VIEWS, fit_views
 from gripper_force.types import Gray
@@ -64,7 +66,10 @@ def test_calibrate_network_keeps_the_views_of_a_checkpoint_if_the_logs_show_few(
 
 
 def test_the_command_tells_the_limit_or_that_the_views_stay(
-    press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
+    press: Callable[..., Clip],
+    write_log: Callable[[Clip, Path], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for seed in range(MIN_VIEWS):
         write_log(replace(press(seed), set=f"s{seed}"), tmp_path)
@@ -75,11 +80,15 @@ def test_the_command_tells_the_limit_or_that_the_views_stay(
     assert views is not None
     assert json.loads(done.stdout)["view_limit"] == views.limit
     assert "left out" not in done.stderr
+    unknown = "times what the network claimed: it does not know what they show"
+    assert unknown in done.stderr, "no network has seen these pictures"
+    monkeypatch.setattr(ood_fit, "UNKNOWN_FACTOR", 1e9)
     first = min(tmp_path.glob("*.mcap"))
     first.unlink()
     clip = press(0)
     write_log(replace(clip, name=first.stem, forces_n=clip.forces_n + 1), tmp_path)
     done = CliRunner().invoke(cli.app, call)
     assert "as before: there are too few sets" in done.stdout
+    assert unknown not in done.stderr
     assert f"warning: left out 1 of {MIN_VIEWS} logs, which start in contact" in done.stderr
     assert f"{2 * MIN_VIEWS}/{2 * MIN_VIEWS}" in done.stderr
