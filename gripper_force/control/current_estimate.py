@@ -86,7 +86,8 @@ class CurrentEstimate:
         # Coulomb friction acts as play: the contact force stays until the motor force differs by friction.
         low_n, high_n = self._motor_force_n - self.friction_n, self._motor_force_n + self.friction_n
         self.force_n = min(max(previous_n, low_n), high_n)
-        if holding and closing_m_s > self._slides_m_s:  # friction acts in full against the motion
+        slides_m_s = self._transmission.speed_share(servo.position_rad) * self._slides_m_s
+        if holding and closing_m_s > slides_m_s:  # friction acts in full against the motion
             self.force_n = low_n
         if free:
             self.force_n = 0.0

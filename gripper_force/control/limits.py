@@ -130,8 +130,9 @@ class Limits:
     def ceiling_a(self, friction_n: float, present_rad: float) -> float:
         """Returns the largest current that the force limit and the servo's current limit allow at a servo angle."""
         max_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
-        limit_n = _CEILING_SHARE * self._force_limit_n / self._transmission.force_bound(present_rad)
+        limit_n = _CEILING_SHARE * self._force_limit_n / self._transmission.torque_constant_bound
         max_n = limit_n + min(max(friction_n, 0.0), max_friction_n)
+        max_n *= self._transmission.force_share(present_rad)
         return min(self._current_limit_a, abs(self._transmission.current_a(max_n, present_rad)))
 
     def _quantise(self, wanted_a: float, ceiling_a: float) -> float:

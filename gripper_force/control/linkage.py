@@ -53,8 +53,8 @@ class RackAndPinion:
         """Returns half of the width's decrease per radian: the travel of each of two jaws."""
         return self.radius_m
 
-    def jaw_m_per_rad_range(self, closing_rad: float, error_rad: float) -> tuple[float, float]:
-        """Returns the least and the greatest travel per radian within an error of the closing angle."""
+    def jaw_m_per_rad_range(self, closing_rad: float) -> tuple[float, float]:
+        """Returns the least and the greatest plausible travel of a jaw per radian."""
         return self.radius_m, self.radius_m
 
 
@@ -66,11 +66,15 @@ class TabulatedLinkage:
         step_rad: Step of the closing angle.
         widths_m: Distance between the jaws, falling.
         jaw_m_per_rads: Travel of one jaw per radian at the same angles.
+        least_m_per_rads: Least travel within `GripperConfig.position_bound_rad` of the same angles.
+        greatest_m_per_rads: Greatest travel there.
     """
 
     step_rad: float
     widths_m: tuple[float, ...]
     jaw_m_per_rads: tuple[float, ...]
+    least_m_per_rads: tuple[float, ...]
+    greatest_m_per_rads: tuple[float, ...]
 
     def width_m(self, closing_rad: float) -> float:
         """Returns the distance between the jaws at a closing angle."""
@@ -95,12 +99,10 @@ class TabulatedLinkage:
         share = min(max(share, 0.0), 1.0)
         return self.jaw_m_per_rads[i] + share * (self.jaw_m_per_rads[i + 1] - self.jaw_m_per_rads[i])
 
-    def jaw_m_per_rad_range(self, closing_rad: float, error_rad: float) -> tuple[float, float]:
-        """Returns the least and the greatest travel per radian within an error of the closing angle."""
-        first, _ = self._interval(closing_rad - error_rad)
-        last, _ = self._interval(closing_rad + error_rad)
-        inside = self.jaw_m_per_rads[first : last + 2]
-        return min(inside), max(inside)
+    def jaw_m_per_rad_range(self, closing_rad: float) -> tuple[float, float]:
+        """Returns the least and the greatest plausible travel of a jaw per radian."""
+        i, _ = self._interval(closing_rad)
+        return min(self.least_m_per_rads[i : i + 2]), max(self.greatest_m_per_rads[i : i + 2])
 
     def _interval(self, closing_rad: float) -> tuple[int, float]:
         i = min(max(int(closing_rad / self.step_rad), 0), len(self.widths_m) - 2)
@@ -130,10 +132,10 @@ def make_linkage(gripper: GripperConfig) -> Linkage:
             closed_m = _finger(config)
         case "table":
             closed_m = _table(config, gripper.open_width_m)
-    return _tabulate(closed_m, gripper.open_width_m)
+    return _tabulate(closed_m, gripper.open_width_m, gripper.position_bound_rad)
 
 
-def _tabulate(closed_m: Callable[[float], float], open_width_m: float) -> TabulatedLinkage:
+def _tabulate(closed_m: Callable[[float], float], open_width_m: float, error_rad: float) -> TabulatedLinkage:
     """Tabulates a decrease of the width by closing angle, up to the closed jaws."""
     if math.isnan(closed_m(0.0)):
         raise ConfigError(
@@ -169,7 +171,11 @@ def _tabulate(closed_m: Callable[[float], float], open_width_m: float) -> Tabula
             "gripper.open_width_m"
         )
     widths_m = [open_width_m - closed_m(angle_rad) for angle_rad in angles_rad]
-    return TabulatedLinkage(step_rad, tuple(widths_m), tuple(slopes))
+    reach = math.ceil(min(error_rad / step_rad, _INTERVALS))
+    near = [slopes[max(i - reach, 0) : i + reach + 1] for i in range(_INTERVALS + 1)]
+    return TabulatedLinkage(
+        step_rad, tuple(widths_m), tuple(slopes), tuple(map(min, near)), tuple(map(max, near))
+    )
 
 
 def _crank_slider(config: LinkageConfig) -> Callable[[float], float]:

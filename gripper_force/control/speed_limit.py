@@ -59,12 +59,12 @@ class SpeedLimit:
     def apply(self, command: ServoCommand, servo: ServoState, speed_m_s: float) -> ServoCommand:
         """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``."""
         distance_rad = command.goal_position_rad - servo.position_rad
-        speed_rad_s = self._rad_per_m(servo.position_rad) * speed_m_s
+        moving_m_s = self._transmission.fastest_closing_m_s(servo.velocity_rad_s, servo.position_rad)
         nears_goal = distance_rad * servo.velocity_rad_s > 0
-        if nears_goal and abs(servo.velocity_rad_s) > _OVERSPEED * speed_rad_s:
+        if nears_goal and abs(moving_m_s) > _OVERSPEED * speed_m_s:
             return replace(command, goal_position_rad=servo.position_rad)
         resisted_a = _RESISTED_FACTOR * math.copysign(servo.current_a, servo.current_a * distance_rad)
-        lead_rad = self._lead_rad(min(command.goal_current_a, resisted_a), servo.position_rad, speed_rad_s)
+        lead_rad = self._lead_rad(min(command.goal_current_a, resisted_a), servo.position_rad, speed_m_s)
         bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
         return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
 
@@ -75,13 +75,9 @@ class SpeedLimit:
         error_rad = _LEAD_FACTOR * abs(current_a) / self._loop.a_per_rad
         return 2 * error_rad * self._transmission.jaw_m_per_rad(position_rad)
 
-    def _lead_rad(self, rest_a: float, position_rad: float, speed_rad_s: float) -> float:
+    def _lead_rad(self, rest_a: float, position_rad: float, speed_m_s: float) -> float:
+        rad_per_m = 1 / self._transmission.jaw_m_per_rad_range(position_rad)[1]
         if self._loop is None:
-            return _UNKNOWN_LEAD_M * self._rad_per_m(position_rad)
-        moving_rad = speed_rad_s / self._loop.gain_per_s
+            return _UNKNOWN_LEAD_M * rad_per_m
+        moving_rad = speed_m_s * rad_per_m / self._loop.gain_per_s
         return _LEAD_FACTOR * max(moving_rad, rest_a / self._loop.a_per_rad)
-
-    def _rad_per_m(self, position_rad: float) -> float:
-        """Returns the least rotation of the horn per metre of a jaw that is plausible at a servo angle."""
-        _, greatest_m_per_rad = self._transmission.jaw_m_per_rad_range(position_rad)
-        return 1 / greatest_m_per_rad

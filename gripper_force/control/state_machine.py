@@ -150,7 +150,7 @@ class GraspController:
         self._hold_m_s = hold_speed_m_s(config, transmission)
         self._slip = SlipMonitor(config, self._hold_m_s)
         self._visual_check = VisualCheck(config)
-        self._largest_target_n = largest_target_n(config.force_limit_n, transmission.largest_force_bound)
+        self._largest_target_n = largest_target_n(config.force_limit_n, transmission.force_bound)
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
         self._estimate = FusedForce(
             0, 0.0, transmission.bias_std_n(0.0), 0.0, 0.0, transmission.friction_n, EstimateSource.CURRENT
@@ -218,7 +218,7 @@ class GraspController:
         if request is not None and refusal:
             events.append(Event(t_ns, "control", f"{_REFUSED}{str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
-            closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, self._present_rad)
+            closing_m_s = self._transmission.fastest_closing_m_s(servo.velocity_rad_s, self._present_rad)
             self._run_phase(t_ns, dt_s, self._width_m, closing_m_s)
         command, is_over = self._limit_command(t_ns, dt_s)
         self._goal_current_a = command.goal_current_a
@@ -244,7 +244,7 @@ class GraspController:
             self._goal_width_m = width_m
         self._width_m, self._servo = width_m, servo
         self._measured_motor_force_n = self._transmission.force_n(servo.current_a, servo.position_rad)
-        closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
+        closing_m_s = self._transmission.fastest_closing_m_s(servo.velocity_rad_s, servo.position_rad)
         is_free = self._phase == Phase.APPROACH and self._approach.moves_freely(
             closing_m_s, self._measured_motor_force_n
         )

@@ -35,7 +35,6 @@ class Transmission:
         friction_std: Standard deviation of true friction, as a share of `friction_n`.
         torque_constant_std: Standard deviation of the true torque constant, as a share of the nominal.
         torque_constant_bound: Largest plausible ratio of the true torque constant to the nominal.
-        position_bound_rad: Largest plausible error of `open_position_rad`.
     """
 
     linkage: Linkage
@@ -48,7 +47,6 @@ class Transmission:
     friction_std: float = 0.25
     torque_constant_std: float = 0.06
     torque_constant_bound: float = 1.4
-    position_bound_rad: float = 0.5
 
     @classmethod
     def from_config(
@@ -71,7 +69,6 @@ class Transmission:
             friction_std=gripper.friction_std,
             torque_constant_std=gripper.gain_std,
             torque_constant_bound=gripper.gain_bound,
-            position_bound_rad=gripper.position_bound_rad,
         )
 
     @property
@@ -104,17 +101,25 @@ class Transmission:
 
     def jaw_m_per_rad_range(self, position_rad: float) -> tuple[float, float]:
         """Returns the least and the greatest travel of a jaw per radian that are plausible at a servo angle."""
-        return self.linkage.jaw_m_per_rad_range(self._closing_rad(position_rad), self.position_bound_rad)
+        return self.linkage.jaw_m_per_rad_range(self._closing_rad(position_rad))
 
-    def force_bound(self, position_rad: float) -> float:
-        """Returns the largest plausible ratio of the true motor force to the nominal at a servo angle."""
-        least_m_per_rad, _ = self.jaw_m_per_rad_range(position_rad)
-        return self.torque_constant_bound * (self.jaw_m_per_rad(position_rad) / least_m_per_rad)
+    def force_share(self, position_rad: float) -> float:
+        """Returns the least plausible ratio of the nominal motor force to the true one, by the linkage alone."""
+        return self.jaw_m_per_rad_range(position_rad)[0] / self.jaw_m_per_rad(position_rad)
+
+    def speed_share(self, position_rad: float) -> float:
+        """Returns the least plausible ratio of the nominal jaw speed to the true one."""
+        return self.jaw_m_per_rad(position_rad) / self.jaw_m_per_rad_range(position_rad)[1]
 
     @property
-    def largest_force_bound(self) -> float:
-        """The largest `force_bound` in the travel."""
-        return max(map(self.force_bound, self._travel_rad()))
+    def force_bound(self) -> float:
+        """Largest plausible ratio of the true motor force to the nominal, anywhere in the travel."""
+        return self.torque_constant_bound / min(map(self.force_share, self._travel_rad()))
+
+    @property
+    def friction_share(self) -> float:
+        """Least plausible ratio of the true friction to the one that a motion shows, anywhere in the travel."""
+        return min(map(self.speed_share, self._travel_rad()))
 
     def impact_m_s(self, force_n: float) -> float:
         """Returns the largest jaw speed whose impact on a hard object stays within a force, anywhere in the travel."""
@@ -127,6 +132,10 @@ class Transmission:
     def closing_m_s(self, velocity_rad_s: float, position_rad: float) -> float:
         """Returns half of the speed at which the width falls: the closing speed of one of two jaws."""
         return self.closing_sign * self.jaw_m_per_rad(position_rad) * velocity_rad_s
+
+    def fastest_closing_m_s(self, velocity_rad_s: float, position_rad: float) -> float:
+        """Returns the `closing_m_s` of the greatest plausible magnitude: what the limits of the speed keep."""
+        return self.closing_m_s(velocity_rad_s, position_rad) / self.speed_share(position_rad)
 
     def force_n(self, current_a: float, position_rad: float) -> float:
         """Returns the motor force at each jaw for a signed motor current."""
@@ -148,6 +157,6 @@ class Transmission:
 
 
 @lru_cache(maxsize=8)
-def largest_force_bound(gripper: GripperConfig) -> float:
+def force_bound(gripper: GripperConfig) -> float:
     """Returns the largest plausible ratio of the true motor force to the nominal, anywhere in the travel."""
-    return Transmission.from_config(gripper, 1.0).largest_force_bound
+    return Transmission.from_config(gripper, 1.0).force_bound

@@ -18,7 +18,6 @@ from typing import Final, Literal, Protocol
 import numpy as np
 
 from gripper_force.config import Config, config_from
-from gripper_force.control.transmission import largest_force_bound
 from gripper_force.errors import ConfigError
 from gripper_force.files import unfinished
 from gripper_force.jobs.grasp import PAPER_OBJECTS, exclusive_device, run_grasp
@@ -170,11 +169,12 @@ def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) 
         seed=task.seed,
         control={  # drawn before the target: each seed keeps its draws
             "feedback": "current",
-            "force_limit_n": 1.3 * MAX_TARGET_N * largest_force_bound(config.gripper),
+            "force_limit_n": 1.3 * MAX_TARGET_N * config.gripper.gain_bound,
             "approach_speed_m_s": float(rng.uniform(0.02, 0.05)),
             "ramp_n_s": float(np.exp(rng.uniform(np.log(3.0), np.log(25.0)))),
             "hold_s": float(rng.uniform(0.3, 1.0)),
         },
+        gripper={"position_bound_rad": 0.0},  # the simulated rig is as configured
         target_n=_draw_target_n(rng),
         vision={"checkpoint": "none"},
     )

@@ -246,7 +246,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int, serv
     drawn = _draw_far(random, config, truth, is_sequence=is_sequence)
     drawn = replace(drawn, mass_kg=servos * drawn.mass_kg)  # of one servo, a jaw has half
     if index % _NEAR == _STREAM_REMAINDER:
-        max_n = largest_target_n(drawn.force_limit_n, truth.largest_force_bound)
+        max_n = largest_target_n(drawn.force_limit_n, truth.force_bound)
         return replace(drawn, requests=tuple(_draw_stream(random, max_n, truth.open_width_m)))
     if index % _NEAR in _NEAR_REMAINDERS:
         return _move_near(random, drawn, truth)
@@ -259,7 +259,7 @@ def _draw_far(random: _Random, config: ControlConfig, truth: Transmission, *, is
     rng, width_m = random.generator, truth.open_width_m
     reach = _REACH_SHARE if is_sequence else 1.0
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
-    max_n = largest_target_n(force_limit_n, truth.largest_force_bound)
+    max_n = largest_target_n(force_limit_n, truth.force_bound)
     min_n = min(0.5, max_n)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
     return Draw(
@@ -324,7 +324,7 @@ def _move_near(random: _Random, drawn: Draw, truth: Transmission) -> Draw:
     to_m = random.between(0.0, truth.open_width_m / 4) if drawn.contact_m == _GONE_M else drawn.contact_m
     limit_n = random.log_between(*_NEAR_LIMIT_N)
     scale = limit_n / drawn.force_limit_n
-    min_n = min(_MIN_N, largest_target_n(limit_n, truth.largest_force_bound))
+    min_n = min(_MIN_N, largest_target_n(limit_n, truth.force_bound))
     return replace(
         drawn,
         begins_m=max(to_m - gap_m, 0.0),

@@ -10,7 +10,7 @@ from gripper_force.config import Config, ControlConfig, GripperConfig
 from gripper_force.control.limits import largest_target_n, rounded_down
 from gripper_force.control.speed_limit import PositionLoop
 from gripper_force.control.state_machine import MAX_CYCLE_S, GraspController
-from gripper_force.control.transmission import Transmission, largest_force_bound
+from gripper_force.control.transmission import Transmission, force_bound
 from gripper_force.errors import ConfigError, RequestError
 from gripper_force.interfaces import ServoSpec
 from gripper_force.plugins import importing
@@ -65,14 +65,12 @@ class ResolvedConfig:
     @property
     def largest_target_n(self) -> float:
         """Largest target that `check_target` accepts."""
-        limit_n = largest_target_n(
-            self.config.control.force_limit_n, largest_force_bound(self.config.gripper)
-        )
+        limit_n = largest_target_n(self.config.control.force_limit_n, force_bound(self.config.gripper))
         return min([limit_n, *self.target_limits_n.values()])
 
     def check_target(self, target_n: float) -> None:
         """Raises `RequestError` if a target is beyond the force limit or a profile's calibrated range."""
-        limit_n, bound = self.config.control.force_limit_n, largest_force_bound(self.config.gripper)
+        limit_n, bound = self.config.control.force_limit_n, force_bound(self.config.gripper)
         largest_n = largest_target_n(limit_n, bound)
         if not checked_number(target_n, "a target") > 0:
             raise RequestError(f"a target of {target_n} N is not a positive force; request more than 0 N")

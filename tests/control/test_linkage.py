@@ -12,10 +12,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig, GripperConfig, LinkageConfig, load_config
+from gripper_force.control.friction_allowance import FrictionAllowance
 from gripper_force.control.limits import Limits
 from gripper_force.control.linkage import RackAndPinion, make_linkage
 from gripper_force.control.speed_limit import SpeedLimit
-from gripper_force.control.transmission import Transmission, largest_force_bound
+from gripper_force.control.transmission import Transmission, force_bound
 from gripper_force.errors import ConfigError
 from gripper_force.qualification.loop_margin.analytic_plant import POSITION_LOOP
 from gripper_force.types import ServoCommand, ServoState
@@ -214,18 +215,32 @@ def with_true_start(believed: Transmission, error_rad: float) -> Transmission:
     st.floats(-1e3, 1e3),
     st.floats(0, 1e3),
     wrong_starts,
+    st.floats(0, 1),
+    st.floats(0, 2),
 )
 def test_no_linkage_leaves_its_travel_or_the_force_limit(
-    name: str, sign: int, share: float, goal_rad: float, goal_a: float, error_rad: float
+    name: str,
+    sign: int,
+    share: float,
+    goal_rad: float,
+    goal_a: float,
+    error_rad: float,
+    earlier_share: float,
+    true_friction_n: float,
 ) -> None:
-    one, control = transmission_of(name, closing_sign=sign), ControlConfig()
-    at_rad = one.position_rad(share * one.open_width_m)
+    one, control = transmission_of(name, closing_sign=sign), ControlConfig(force_limit_n=5.0)
+    truth = with_true_start(one, error_rad)
+    at_rad, earlier_rad = (one.position_rad(s * one.open_width_m) for s in (share, earlier_share))
+    allowance = FrictionAllowance(control, one)
+    shows_a = truth.current_a(true_friction_n / one.torque_constant_bound, earlier_rad)
+    allowance.learn(one.force_n(shows_a, earlier_rad), only_lower=False)
+    friction_n = allowance.allowance_n(math.inf, opening=False, closing=True, gripping=True)
     wanted = ServoCommand(0, goal_rad, goal_a)
-    command, _ = Limits(control, one, 1e3).apply(wanted, 0.0, 0.0, 0.0, at_rad, 60.0, may_rise=True)
+    command, _ = Limits(control, one, 1e3).apply(wanted, 0.0, friction_n, 0.0, at_rad, 60.0, may_rise=True)
     low_rad, high_rad = one.goal_range_rad
     assert low_rad <= command.goal_position_rad <= high_rad
-    force_n = with_true_start(one, error_rad).force_n(sign * command.goal_current_a, at_rad)
-    assert force_n * one.torque_constant_bound <= 1.05 * control.force_limit_n
+    force_n = one.torque_constant_bound * truth.force_n(sign * command.goal_current_a, at_rad)
+    assert force_n - true_friction_n <= 1.05 * control.force_limit_n
 
 
 @given(grippers, st.floats(0, 1), wrong_starts)
@@ -244,13 +259,13 @@ def test_no_linkage_is_too_fast_with_a_wrong_start(name: str, share: float, erro
 @pytest.mark.parametrize("name", GRIPPERS)
 def test_the_force_bound_covers_torque_constant_and_linkage(name: str) -> None:
     one = transmission_of(name)
-    exact = replace(one, position_bound_rad=0.0)
-    assert exact.largest_force_bound == pytest.approx(1.4, rel=0.02)
-    assert one.largest_force_bound == largest_force_bound(GRIPPERS[name])
+    exact = transmission_of(name, position_bound_rad=0.0)
+    assert exact.force_bound == pytest.approx(1.4, rel=0.02)
+    assert one.force_bound == force_bound(GRIPPERS[name])
     if GRIPPERS[name].linkage.kind == "rack":
-        assert one.largest_force_bound == 1.4
+        assert one.force_bound == 1.4
     else:
-        assert one.largest_force_bound > 1.05 * exact.largest_force_bound
+        assert one.force_bound > 1.05 * exact.force_bound
 
 
 CRANK = {"kind": "crank_slider", "crank_m": 0.022, "rod_m": 0.036, "open_crank_rad": 1.1}

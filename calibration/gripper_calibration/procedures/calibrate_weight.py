@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from gripper_calibration.procedures.calibrate_servo import PLAUSIBLE_RATIO
 from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
 from gripper_force.config import Config
-from gripper_force.control.transmission import largest_force_bound
+from gripper_force.control.transmission import force_bound
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.profiles.rig_profile import CalibratedValue, torque_settings
 from gripper_force.progress import Progress, Prompt, no_progress
@@ -90,9 +90,7 @@ def masses_kg(config: Config) -> tuple[float, float]:
             f"this gripper has {'two servos' if len(config.servo.ids) > 1 else f'linkage {kind}'}; use a load cell"
         )
     gripper = config.gripper
-    max_n = 2 * (
-        config.control.force_limit_n / largest_force_bound(gripper) / _FORCE_FACTOR - gripper.friction_n
-    )
+    max_n = 2 * (config.control.force_limit_n / force_bound(gripper) / _FORCE_FACTOR - gripper.friction_n)
     min_kg = math.ceil(1e3 * 2 * _MIN_N / STANDARD_GRAVITY_M_S2) / 1e3
     max_kg = math.floor(1e3 * max_n / STANDARD_GRAVITY_M_S2) / 1e3
     if max_kg < min_kg:

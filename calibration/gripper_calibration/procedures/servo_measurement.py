@@ -12,7 +12,7 @@ from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, tor
 from gripper_force.config import Config, GripperConfig
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.linkage import make_linkage
-from gripper_force.control.transmission import Transmission, largest_force_bound
+from gripper_force.control.transmission import Transmission, force_bound
 from gripper_force.errors import DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell
 from gripper_force.jobs.recording.record import FIRST_SAMPLE_NS
@@ -79,9 +79,7 @@ def measure(
         jaws.tare()
         jaws.step_name = "closing on the gauge"
         contact_rad = jaws.close_on_gauge(gauge_m)
-        peak_n = _PEAK_SHARE * largest_target_n(
-            config.control.force_limit_n, largest_force_bound(config.gripper)
-        )
+        peak_n = _PEAK_SHARE * largest_target_n(config.control.force_limit_n, force_bound(config.gripper))
         presses = []
         for number, (rate_n_s, share) in enumerate(PRESSES, start=1):
             jaws.step_name = f"{1e3 * gauge_m:g} mm, press {number} of {len(PRESSES)}"

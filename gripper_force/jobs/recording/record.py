@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.limits import largest_target_n, rounded_down
 from gripper_force.control.state_machine import Decision
-from gripper_force.control.transmission import largest_force_bound
+from gripper_force.control.transmission import force_bound
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.files import unfinished
 from gripper_force.interfaces import Devices
@@ -232,7 +232,7 @@ def _checked(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
             raise ConfigError(f"record needs a {name}, but {unit}.backend is none; set {unit}.backend")
     check_name(config.object)
     limit_n = config.control.force_limit_n
-    max_n = largest_target_n(limit_n, largest_force_bound(config.gripper))
+    max_n = largest_target_n(limit_n, force_bound(config.gripper))
     peak_n = min(DEFAULT_PEAK_N, max_n) if plan.peak_n is None else plan.peak_n
     if not _MIN_PEAK_N < peak_n <= max_n:
         raise ConfigError(

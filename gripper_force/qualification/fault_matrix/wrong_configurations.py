@@ -16,7 +16,7 @@ import numpy as np
 from gripper_force.config import Config, config_from
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import is_open
-from gripper_force.control.transmission import largest_force_bound
+from gripper_force.control.transmission import force_bound
 from gripper_force.errors import ConfigError, DeviceError, GripperError, SimulationError
 from gripper_force.interfaces import WorldState
 from gripper_force.jobs.grasp import PAPER_OBJECTS
@@ -270,7 +270,7 @@ def draw(config: Config, row: WrongCase, index: int) -> tuple[Tree, dict[str, An
     target_n = round(float(rng.uniform(*TRIAL_TARGETS_N)), 3)
     # Half of the grasps are at an end of the range, in turn with every object.
     share = {0: 0.0, 1: 1.0}.get((index + index // 4) % 4, float(rng.uniform()))
-    lowest_limit_n = target_n / largest_target_n(1.0, largest_force_bound(config.gripper))
+    lowest_limit_n = target_n / largest_target_n(1.0, force_bound(config.gripper))
     is_blind = row.feedback == "current" or (row.feedback == "both" and index // 4 % 2)
     keys = {
         "object": PAPER_OBJECTS[index % len(PAPER_OBJECTS)],

@@ -116,10 +116,7 @@ class _Bounds:
         max_friction_n = rig.friction_n * (1 + 3 * rig.friction_std)
         self._max_a = min(
             config.servo.current_limit_a,
-            (
-                _CEILING_SHARE * config.control.force_limit_n / rig.force_bound(rig.open_position_rad)
-                + max_friction_n
-            )
+            (_CEILING_SHARE * config.control.force_limit_n / rig.torque_constant_bound + max_friction_n)
             / rig.n_per_a(rig.open_position_rad),
         )
         self._low_rad, self._high_rad = rig.goal_range_rad
