@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig, GripperConfig, LinkageConfig, load_config
@@ -218,6 +218,10 @@ def with_true_start(believed: Transmission, error_rad: float) -> Transmission:
     st.floats(0, 1),
     st.floats(0, 2),
 )
+@example(
+    "viperx_aloha", 1, 0.35, 9.0, 1e3, -0.5, 1.0, 0.95
+)  # friction shown where the true travel is greatest
+@example("viperx_aloha", 1, 0.35, 9.0, 1e3, 0.5, 1.0, 0.95)
 def test_no_linkage_leaves_its_travel_or_the_force_limit(
     name: str,
     sign: int,
