@@ -19,9 +19,15 @@ _RETURN_S = 0.05
 closing side of friction within `_RETURN_S`, which stops the jaws. A later return would let their inertia carry them
 too far."""
 
+_SETTLE_S = 0.2
+"""After a lowering, the integral waits for this time: the jaws first close by what the lowering opened them too far,
+and the estimate follows late."""
+
 _LOWER_AT_ONCE_S = 0.05
-"""A lowering that ends above the tolerance is followed at once by a second one of twice this time. The first leaves a
-stiff object with too much force: the motor force returns before its lag lets it reach its lowest value."""
+_LOWER_AT_ONCE_SHARE = 2.0
+"""A lowering that ends this multiple of the tolerance above the target is followed at once by a second one of twice
+`_LOWER_AT_ONCE_S`. The first leaves a stiff object with too much force: the motor force returns before its lag lets it
+reach its lowest value. At a soft object, inertia opens the jaws further than the motor current shows."""
 
 _LOWERING_WAIT_S = 1.0
 """Longest total wait of a lowering, whatever the measured speed is."""
@@ -92,7 +98,7 @@ class ForceLoop:
         self._trim_n = 0.0
         self._friction_side = 1.0  # share of friction to overcome: 1 to close, -1 to open
         self._is_reversed = self.is_lowering = self._may_lower_at_once = False
-        self._repeat_left_s = self._too_high_s = self._waited_s = 0.0
+        self._repeat_left_s = self._too_high_s = self._waited_s = self._settle_left_s = 0.0
         self._lowering_start_n = self._highest_reference_n = 0.0
 
     @property
@@ -102,7 +108,8 @@ class ForceLoop:
 
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
-        self._trim_n, self._repeat_left_s, self._may_lower_at_once = 0.0, 0.0, False
+        self._trim_n, self._repeat_left_s, self._settle_left_s = 0.0, 0.0, 0.0
+        self._may_lower_at_once = False
         self._highest_reference_n = self._lowering_start_n = force_n
         self._waited_s = 0.0
         self._start_ramp(force_n, target_n)
@@ -162,7 +169,10 @@ class ForceLoop:
             self._friction_side = min(self._friction_side + 2 * dt_s / _RETURN_S, 1.0)
             self.is_lowering = self._friction_side < 1.0
             if not self.is_lowering:
+                if not self._vision_alone:  # the bias of a larger force says little about this one
+                    self._trim_n = 0.0
                 self._lower_at_once(target_n, estimate)
+        self._settle_left_s = _SETTLE_S if self.is_lowering else max(self._settle_left_s - dt_s, 0.0)
         if self.is_lowering:
             waits = -closing_m_s > self._max_opening_m_s and self._waited_s < _LOWERING_WAIT_S
             self._waited_s += dt_s * waits
@@ -175,7 +185,7 @@ class ForceLoop:
         error_n = 0.0
         # A constant motor force holds a constant contact force. The current alone carries no new information
         # on friction, so it is not fed back.
-        if not (ramping or waits or self.is_lowering) and estimate.source != EstimateSource.CURRENT:
+        if not (ramping or waits or self._settle_left_s > 0) and estimate.source != EstimateSource.CURRENT:
             error_n = self._beyond_deadband(reference_n - estimate.force_n, tolerance_n(target_n))
             self._trim_n += self._gains.integral_s * error_n * dt_s
         elif ramping and not self._vision_alone:
@@ -193,7 +203,7 @@ class ForceLoop:
         """Lowers the force again if it is still too high by motor current; one visual estimate may be an outlier."""
         may_lower = self._may_lower_at_once and estimate.source != EstimateSource.VISION
         self._may_lower_at_once = False
-        if may_lower and estimate.force_n > target_n + tolerance_n(target_n):
+        if may_lower and estimate.force_n > target_n + _LOWER_AT_ONCE_SHARE * tolerance_n(target_n):
             self._start_ramp(min(estimate.force_n, self._lowering_start_n), target_n, _LOWER_AT_ONCE_S)
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:

@@ -185,7 +185,7 @@ def test_lowering_falls_below_friction_and_returns(loop, transmission):
     assert not any(lowered[lowered.index(False) :])
 
 
-@pytest.mark.parametrize(("left_n", "falls"), [(0.05, 1), (0.3, 2), (-0.3, 1)])
+@pytest.mark.parametrize(("left_n", "falls"), [(0.05, 1), (0.15, 1), (0.3, 2), (-0.3, 1)])
 def test_lowering_that_leaves_too_much_force_is_repeated_once(loop, left_n, falls):
     ramp(loop, 4.0)
     loop.retarget(2.0)
@@ -277,11 +277,14 @@ def test_too_much_force_after_a_rise_starts_no_lowering(loop, how):
         assert not loop.is_lowering
 
 
-def test_the_integral_waits_for_the_end_of_a_lowering(loop, transmission):
-    ramp(loop, 4.0)
-    ended_n = lower(loop, 2.0, seen_n=-0.5)
+def test_the_integral_waits_until_a_lowering_has_settled(loop, transmission):
+    ramp(loop, 4.0, bias_n=0.3)  # the bias of the larger force does not count, either
+    motor_n = [lower(loop, 2.0, seen_n=-0.5)]
+    motor_n += [loop.step(0.005, 2.0, estimate(1.5)) for _ in range(40)]
+    assert motor_n[:-2] == pytest.approx([2.0 + transmission.friction_n] * 39)
     one_cycle_n = 0.5 * 0.005 * loop_gains(ControlConfig(), vision_alone=False).integral_s
-    assert ended_n == pytest.approx(2.0 + transmission.friction_n + one_cycle_n)
+    assert motor_n[-1] - motor_n[-2] == pytest.approx(one_cycle_n)
+    assert motor_n[-1] > motor_n[0]
 
 
 @pytest.mark.parametrize("closing_m_s", [-0.05, -1.0])
