@@ -128,7 +128,8 @@ class Gripper:
 
         Args:
             force_n: Target force, in newtons: more than 0, at most 0.9 times ``control.force_limit_n`` over
-                ``gripper.gain_bound``, and at most what the profiles were calibrated with.
+                ``gripper.gain_bound`` (less with a linkage, see `largest_force_n`), and at most what the profiles were
+                calibrated with.
             wait: False returns at once; `state` shows the progress.
             new_object: True if the camera sees another object than in the grasps before, or was moved since: the
                 newest frames become the reference of vision, and the gain that was learned is forgotten. The jaws must

@@ -101,7 +101,7 @@ class JawsResult:
 def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_progress) -> JawsResult:
     """Closes and opens the empty jaws with a small current and proposes the configuration.
 
-    The configured geometry is only used for the travel per radian and for plausibility.
+    The lengths of a linkage are not measured: they must be right.
 
     Args:
         config: The configuration.
@@ -202,7 +202,7 @@ def _proposal(
             "gripper.pinion_radius_m or gripper.linkage, and that nothing lies between the jaws"
         )
     if gripper.linkage.kind != "rack":  # its geometry determines the width
-        bound_rad = _GIVES_RAD + abs(travel_rad - expected_rad)
+        bound_rad = math.ceil(100 * (_GIVES_RAD + abs(travel_rad - expected_rad))) / 100
         return gripper.open_width_m, closed_rad - sign * expected_rad, bound_rad
     inset_rad = _INSET_M / (2 * gripper.pinion_radius_m)
     return 2 * gripper.pinion_radius_m * (travel_rad - inset_rad), open_rad + sign * inset_rad, None

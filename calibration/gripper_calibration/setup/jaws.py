@@ -59,7 +59,7 @@ def jaws(task: Task) -> StepResult:
     }
     if result.position_bound_rad is not None:
         values["gripper.position_bound_rad"] = Found(
-            round(result.position_bound_rad, 2), "of the ends and the linkage"
+            result.position_bound_rad, "error of the ends, and of the linkage's travel"
         )
     found_keys = (key.partition(".") for key in values)
     gripper = {key: values[f"gripper.{key}"].value for part, _, key in found_keys if part == "gripper"}

@@ -237,7 +237,7 @@ def _checked(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
     if not _MIN_PEAK_N < peak_n <= max_n:
         raise ConfigError(
             f"peaks of up to {peak_n:g} N are not within {_MIN_PEAK_N:g} to {rounded_down(max_n)} N, the range for "
-            f"control.force_limit_n {limit_n:g} N; set another --peak-n or limit"
+            f"control.force_limit_n {limit_n:g} N; set another --peak-n or limit, or run calibrate jaws and servo first"
         )
     return config.with_values(control={"feedback": "current"}, vision={"checkpoint": "none"}), peak_n
 
