@@ -190,7 +190,7 @@ def test_the_code_that_an_embedding_program_reaches_is_small() -> None:
     assert not packages & {f"gripper_force.{name}" for name in ("cli", "qualification", "jobs", "testing")}
 
     assert "gripper_hw.sim.world" in reached - core
-    assert 5_000 < sum(map(_lines_of_code, core)) <= 8_545
+    assert 5_000 < sum(map(_lines_of_code, core)) <= 8_555
     assert sum(map(_lines_of_code, reached - core)) <= 3_030
 
 
