@@ -24,10 +24,11 @@ _SETTLE_S = 0.2
 and the estimate follows late."""
 
 _LOWER_AT_ONCE_S = 0.05
-_LOWER_AT_ONCE_SHARE = 2.0
-"""A lowering that ends this multiple of the tolerance above the target is followed at once by a second one of twice
-`_LOWER_AT_ONCE_S`. The first leaves a stiff object with too much force: the motor force returns before its lag lets it
-reach its lowest value. At a soft object, inertia opens the jaws further than the motor current shows."""
+_SEEN_LOWER_AT_ONCE = 2.0
+"""A lowering that ends above the tolerance is followed at once by a second one of twice `_LOWER_AT_ONCE_S`. The first
+leaves a stiff object with too much force: the motor force returns before its lag lets it reach its lowest value. At a
+soft object, inertia opens the jaws further than the motor current shows. So with a camera, which corrects it later, the
+second one begins above this multiple of the tolerance only."""
 
 _LOWERING_WAIT_S = 1.0
 """Longest total wait of a lowering, whatever the measured speed is."""
@@ -203,7 +204,8 @@ class ForceLoop:
         """Lowers the force again if it is still too high by motor current; one visual estimate may be an outlier."""
         may_lower = self._may_lower_at_once and estimate.source != EstimateSource.VISION
         self._may_lower_at_once = False
-        if may_lower and estimate.force_n > target_n + _LOWER_AT_ONCE_SHARE * tolerance_n(target_n):
+        share = 1.0 if estimate.source == EstimateSource.CURRENT else _SEEN_LOWER_AT_ONCE
+        if may_lower and estimate.force_n > target_n + share * tolerance_n(target_n):
             self._start_ramp(min(estimate.force_n, self._lowering_start_n), target_n, _LOWER_AT_ONCE_S)
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:

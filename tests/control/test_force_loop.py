@@ -185,15 +185,27 @@ def test_lowering_falls_below_friction_and_returns(loop, transmission):
     assert not any(lowered[lowered.index(False) :])
 
 
-@pytest.mark.parametrize(("left_n", "falls"), [(0.05, 1), (0.15, 1), (0.3, 2), (-0.3, 1)])
-def test_lowering_that_leaves_too_much_force_is_repeated_once(loop, left_n, falls):
+@pytest.mark.parametrize(
+    ("left_n", "source", "falls"),
+    [
+        (0.05, "current", 1),
+        (0.15, "current", 2),
+        (0.15, "fused", 1),
+        (0.3, "current", 2),
+        (0.3, "fused", 2),
+        (-0.3, "current", 1),
+    ],
+)
+def test_lowering_that_leaves_too_much_force_is_repeated_once(loop, left_n, source, falls):
     ramp(loop, 4.0)
     loop.retarget(2.0)
     lowered = []
     for _ in range(200):
         left = left_n if not loop.is_lowering else max(left_n, 0.0)
-        loop.step(0.005, 2.0, estimate(loop.reference_n + left, source="current"))
+        loop.step(0.005, 2.0, estimate(loop.reference_n + left, source=source))
         lowered.append(loop.is_lowering)
+        if not loop.is_lowering and len(lowered) > 120:
+            break  # later the camera may repeat it
     starts = [now and not before for before, now in zip([False, *lowered], lowered, strict=False)]
     shows_again = [now < before for before, now in zip([False, *lowered], lowered, strict=False)]
     assert lowered[0]
