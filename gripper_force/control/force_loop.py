@@ -24,7 +24,7 @@ _SETTLE_S = 0.2
 and the estimate follows late."""
 
 _LOWER_AT_ONCE_S = 0.05
-_SEEN_LOWER_AT_ONCE = 2.0
+_SEEN_LOWER_AT_ONCE = 1.5
 """A lowering that ends above the tolerance is followed at once by a second one of twice `_LOWER_AT_ONCE_S`. The first
 leaves a stiff object with too much force: the motor force returns before its lag lets it reach its lowest value. At a
 soft object, inertia opens the jaws further than the motor current shows. So with a camera, which corrects it later, the

@@ -189,8 +189,8 @@ def test_lowering_falls_below_friction_and_returns(loop, transmission):
     ("left_n", "source", "falls"),
     [
         (0.05, "current", 1),
-        (0.15, "current", 2),
-        (0.15, "fused", 1),
+        (0.12, "current", 2),
+        (0.12, "fused", 1),
         (0.3, "current", 2),
         (0.3, "fused", 2),
         (-0.3, "current", 1),
