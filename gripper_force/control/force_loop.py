@@ -109,10 +109,9 @@ class ForceLoop:
 
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
-        self._trim_n, self._repeat_left_s, self._settle_left_s = 0.0, 0.0, 0.0
+        self._trim_n = self._repeat_left_s = self._settle_left_s = self._waited_s = 0.0
         self._may_lower_at_once = False
         self._highest_reference_n = self._lowering_start_n = force_n
-        self._waited_s = 0.0
         self._start_ramp(force_n, target_n)
 
     def retarget(self, target_n: float) -> None:
