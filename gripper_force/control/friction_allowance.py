@@ -34,7 +34,7 @@ class FrictionAllowance:
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._safe_n = _UNKNOWN_SHARE * config.force_limit_n / transmission.force_bound
-        self._share = transmission.friction_share
+        self._true_share = transmission.friction_share
         self._breakaway_n = transmission.friction_n + _BREAKAWAY_N
         self.shown_n = math.inf
         self.was_shown_in_grasp = self._starts_open = self._has_moved = False
@@ -75,7 +75,7 @@ class FrictionAllowance:
         """
         if friction_n is not None:
             self.was_shown_in_grasp = True
-            friction_n *= self._share
+            friction_n *= self._true_share
             self.shown_n = min(friction_n, self.shown_n) if only_lower else friction_n
 
     def allowance_n(self, friction_n: float, *, opening: bool, closing: bool, gripping: bool) -> float:

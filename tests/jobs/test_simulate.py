@@ -5,7 +5,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.config import Config, config_from_text, dump_config, load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs import simulate as module
 from gripper_force.jobs.grasp import PAPER_OBJECTS
@@ -148,6 +148,14 @@ def test_failed_simulation_leaves_no_log(config: Config, tmp_path: Path) -> None
     with pytest.raises(ConfigError, match="no simulated object 'egg'"):
         make_log(SimulationPlan("press", "egg", 5), tmp_path, config.model_dump(mode="json"))
     assert not list(tmp_path.glob("*.mcap"))
+
+
+def test_logs_of_a_steep_linkage_can_be_read() -> None:
+    linkage = {"kind": "finger", "finger_m": 0.06, "open_finger_rad": 1.4}
+    config = load_config(None, [f"gripper.linkage={linkage}", "gripper.open_width_m=0.058"])
+    rng = np.random.default_rng(0)
+    made = module._randomised(config, SimulationPlan("press", "tube", 100_000), rng)
+    assert config_from_text(dump_config(made), "a log").control.force_limit_n < 25
 
 
 def test_draws_of_a_press_do_not_change() -> None:

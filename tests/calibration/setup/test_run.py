@@ -292,6 +292,16 @@ def test_a_damaged_state_and_an_unknown_step_are_named(tmp_path: Path) -> None:
         Setup(tmp_path / "new.yaml", only="jaw")
 
 
+def test_the_jaws_of_a_linkage_get_a_smaller_bound(tmp_path: Path) -> None:
+    linkage = load_config(EXAMPLES / "viperx_oak.yaml").gripper.linkage
+    keys = {key: value for key, value in linkage.model_dump().items() if value}
+    overrides = [*SIMULATED, f"gripper.linkage={keys}", "gripper.open_width_m=0.072"]
+    (report,) = Setup(tmp_path / "rig.yaml", overrides, only="jaws").run(Script())
+    bound_rad = report.values["gripper.position_bound_rad"]
+    assert 0.05 < bound_rad < 0.25
+    assert load_config(tmp_path / "rig.yaml").gripper.position_bound_rad == bound_rad
+
+
 @pytest.mark.parametrize("name", ["xm430_oak_hx711", "xl330_webcam_hx711", "viperx_oak"])
 def test_an_example_to_start_from_is_valid(name: str) -> None:
     config = load_config(EXAMPLES / f"{name}.yaml")
